@@ -21,7 +21,7 @@ import lqrsim.gym
 from lqrsim import cli
 from lqrsim.results.solution_parts import Status
 from lqrsim.scenarios.references import resolve
-from lqrsim.solvers import budget, free_duration, strategy
+from lqrsim.solvers import budget, free_duration, smoother
 from lqrsim.solvers.settings import SmootherSettings
 
 
@@ -240,7 +240,7 @@ def test_seconds_of_an_iteration_are_its_own(monkeypatch: pytest.MonkeyPatch) ->
 
     def solve(fixed: ls.Problem, settings: SmootherSettings) -> ls.Solution:
         now[0] += 100.0
-        return strategy.solve_fixed(fixed, settings, stop)
+        return smoother.solve_fixed(fixed, settings, stop)
 
     solution = free_duration.solve_for_duration(problem(), SmootherSettings(), solve, stop)
     assert solution.status is Status.CONVERGED
@@ -263,9 +263,9 @@ def test_the_time_limit_is_that_of_the_whole_solve(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(budget, "time", SimpleNamespace(perf_counter=read))
     short, options = dataclasses.replace(problem(), dt=1 / 20), SmootherSettings()
-    assert strategy.solve(short, options).success
+    assert smoother.solve(short, options).success
     whole, now[0] = now[0], 0.0
-    limited = strategy.solve(short, dataclasses.replace(options, time_limit=share * whole))
+    limited = smoother.solve(short, dataclasses.replace(options, time_limit=share * whole))
     assert limited.status is Status.TIME_LIMIT or (limited.success and share > 0.01)
     assert now[0] <= share * whole + 40
     assert whole > 300

@@ -15,7 +15,7 @@ from sampling import examples, rarely
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.scenes.scene import scene_from_xml
-from lqrsim.solvers import budget, strategy
+from lqrsim.solvers import budget, smoother, strategy
 from lqrsim.solvers.settings import SmootherSettings
 
 OPTION = '<option timestep="0.005" tolerance="1e-14"/><compiler autolimits="true"/>'
@@ -255,7 +255,7 @@ def test_a_failed_plan_among_contacts_says_that_time_was_over(monkeypatch: pytes
         search._finished[0] = first, replace(found, status=ls.Status.STALLED, detail="no step lowers the cost")
 
     monkeypatch.setattr(strategy.Search, "finish_promising", run)
-    solution = strategy.solve(problem, replace(options, time_limit=limit))
+    solution = smoother.solve(problem, replace(options, time_limit=limit))
     assert solution.status is ls.Status.TIME_LIMIT
     assert np.isfinite(solution.cost)
     assert solution.remedy.startswith("raise time_limit")

@@ -6,7 +6,7 @@ along an obstacle would oscillate, since the model leaves out the curvature of o
 settle, the damped ones of the safeguard minimise each augmented Lagrangian.
 
 The method serves problems that the interior point does not take: noise with constraints, and `finish=None`. It is also
-one of the attempts of `constrained.py`, among obstacles and with the dynamics of an MJCF. The compiled part is in
+one of the attempts of `finish.py`, among obstacles and with the dynamics of an MJCF. The compiled part is in
 `kernels/augmented_lagrangian.py`.
 """
 
@@ -137,7 +137,7 @@ def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool, 
             break
         # From the optimum without constraints they soon settle or cycle. If they cycle, damped iterations are much
         # faster.
-        off = max(last.gap / most, last.violation / run.settings.violation_tolerance(run.problem))
+        off = max(last.gap / most, last.violation / run.allowed)
         stale = 0 if off < CLOSER * nearest else stale + 1
         nearest = min(off, nearest)
         if stale == patience and not known and run.settings.safeguard:
@@ -264,7 +264,7 @@ class AugmentedLagrangian:
 
     def __init__(self, run: SolveRun) -> None:
         self._problem, self._work, self._constraints = run.problem, run.work, run.work.multipliers
-        self._allowed = tolerance = run.settings.violation_tolerance(run.problem)
+        self._allowed = tolerance = run.allowed
         # The tolerances of inequalities and of equalities, if there are any.
         terms = run.problem.constraint_terms
         self._tolerance = {term.equality: allowed_violation(term, tolerance) or tolerance for term in terms}

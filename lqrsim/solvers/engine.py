@@ -149,7 +149,7 @@ class SolveRun:
       initial_guess: the start. work: the memory. budget: the iterations and the time.
       ending: the state of smoothing or iLQR; the outcome is RUNNING until it has ended.
       second_order: whether Newton's method, or with constraints the interior point, ends the solve. final, rough: the
-        tolerances of the answer, and of the smoothing before it; see `SmootherSettings`.
+        tolerances of the answer, and of the smoothing before it; allowed: that of constraints; see `SmootherSettings`.
     """
 
     def __init__(
@@ -169,6 +169,7 @@ class SolveRun:
         self.ending = Ending(declarations.RUNNING)
         self.second_order = settings.second_order(problem)
         self.final, self.rough = settings.final(problem), settings.rough(problem)
+        self.allowed = settings.violation_tolerance(problem)
         self._valley = VALLEY if self.second_order and has_curvature(problem) else 0.0
         # Fractions of the obstacle costs in the iterations; the last fraction holds for all later iterations.
         self._fractions = (*(initial_guess.prior.obstacles if initial_guess.prior is not None else ()), 1.0)
@@ -798,6 +799,11 @@ class Workspace:
         allowed = partial(allowed_violation, tolerance=self._tolerance, spared=not self._exact)
         pairs = zip((multipliers.term for multipliers in self.multipliers), values, strict=True)
         return self.priced or all(violation_of(term, numbers) <= allowed(term) for term, numbers in pairs)
+
+
+def copied(plan: RunResult | Trajectory | Motion) -> Motion:
+    """A copy of the states and controls of a plan."""
+    return Motion(plan.states.copy(), plan.controls.copy())
 
 
 _pool = Pool[Workspace]()

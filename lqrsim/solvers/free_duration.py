@@ -26,7 +26,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory
 from lqrsim.solvers.budget import Budget, Laps, Stop
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resampled, resolve
-from lqrsim.solvers.interior_point import MEDIUM, STRONG, WEAK, Barrier, InteriorPoint, InteriorResult, Measures
+from lqrsim.solvers.interior_point import MEDIUM, STRONG, WEAK, Barrier, InteriorPoint, InteriorResult
 from lqrsim.solvers.settings import SmootherSettings
 from lqrsim.solvers.stages import Stages
 from lqrsim.solvers.tree import ways_by_trees
@@ -145,7 +145,9 @@ class DurationSearch:
             states = np.column_stack([states, np.full(len(states), horizon)])
             prices[stages.owners == len(problem.constraint_terms)] = np.inf  # the bounds of the duration
         point = InteriorPoint(stages, Motion(*map(in_c_order, (states, begin.controls))), STRONG, price=prices)
-        result = point.run(tolerance=ROUGH, violation=KEPT, most=SKETCH, watch=_recorder(budget))
+        result = point.run(
+            tolerance=ROUGH, violation=KEPT, most=SKETCH, laps=Laps(budget), over=lambda *_: self._stop.due
+        )
         stages.give_back()
         plan, measures = result.plan, result.measures
         name, cost = way.name, measures.cost
@@ -323,17 +325,6 @@ class DurationSearch:
         )
 
 
-def _recorder(budget: Budget) -> Callable[[Measures, float], bool]:
-    """What the interior point calls after each iteration, which joins the log; at the deadline it ends."""
-    laps = Laps(budget)
-
-    def watch(measures: Measures, seconds: float) -> bool:
-        measures.record(laps, seconds=seconds)
-        return budget.stop.due
-
-    return watch
-
-
 def _paid(stages: Stages, plan: Motion, price: float | Array) -> float:
     """The price of all violations of a plan, at a price of each row (R,)."""
     prices, numbers = np.where(np.isfinite(price) & (stages.owners >= 0), price, 0.0), stages.values(plan)
@@ -380,7 +371,7 @@ def _searched(
     with budget.stop.not_counting():  # compiling
         stages = Stages(with_duration_state(problem, by_segment=bool(segments)))
     stages.jump(segments)
-    watch = _recorder(budget)
+    laps = Laps(budget)
     states = np.column_stack([begin.states, np.full(len(begin.states), begin.horizon)])
     plan = Motion(in_c_order(states), in_c_order(begin.controls))
     # The bounds of the duration hold at any price.
@@ -388,8 +379,10 @@ def _searched(
 
     def run(plan: Motion, barrier: Barrier, tolerance: float, multipliers: tuple[Array, ...] = ()) -> InteriorResult:
         point = InteriorPoint(stages, plan, barrier, price=prices, multipliers=multipliers)
-        most = min(MOST, budget.left)
-        return point.run(tolerance=tolerance, violation=violation, most=most, watch=watch, hurried=budget.hurried)
+        return point.run(
+            tolerance=tolerance, violation=violation, most=min(MOST, budget.left), hurried=budget.hurried,
+            laps=laps, over=lambda *_: budget.stop.due,
+        )  # fmt: skip
 
     held = None
     if hold:

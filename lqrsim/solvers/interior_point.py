@@ -116,16 +116,23 @@ class InteriorPoint:
 
     def run(
         self, *, tolerance: float, violation: float, most: int, near: bool = False, hurried: bool = True,
-        watch: Callable[[Measures, float], bool] = lambda measures, seconds: False,
+        laps: Laps | None = None, over: Callable[[Measures, float], bool] = lambda measures, seconds: False,
     ) -> InteriorResult:  # fmt: skip
-        """Iterate until the measures are within tolerance, no step helps, or `watch` ends it.
+        """Iterate until the measures are within tolerance, no step helps, or it is `over`.
 
         Args:
           tolerance: of stationarity, gaps and complementarity. violation: that of the constraints, in their units.
           near: whether the plan may be next to the answer.
-          watch: called with the measures of each iteration, and its seconds; True ends the run.
+          laps: which record the iterations.
+          over: called with the measures of each iteration, and its seconds, once it is recorded; True ends the run.
           hurried: whether it is to be called after each iteration, rather than after `ATTENTION` seconds.
         """
+
+        def watch(measures: Measures, seconds: float) -> bool:
+            if laps is not None:
+                measures.record(laps, seconds=seconds)
+            return over(measures, seconds)
+
         self._log = np.zeros(most, MEASURES)
         if len(self._arrays.filter) < most:  # like the log, the filter gets a row at each iteration
             self._arrays = self._arrays._replace(filter=np.zeros((most, 2)))
@@ -207,15 +214,14 @@ class Restored(NamedTuple):
 
 
 def restore(
-    stages: Stages, plan: Motion, sizes: Sizes, *, price: float, most: int,
-    watch: Callable[[float, float, float, float], bool], stationary: Callable[[Motion, list[Array]], bool],
-    hurried: bool = True,
+    stages: Stages, plan: Motion, sizes: Sizes, *, price: float, most: int, laps: Laps, over: Callable[[], bool],
+    stationary: Callable[[Motion, list[Array]], bool], hurried: bool = True,
 ) -> Restored | None:  # fmt: skip
     """Descend from the rollout of a plan's controls (T, m); None if a trajectory is not finite, or there is no step.
 
     Args:
       price: of violating a constraint by its typical size, in units of the typical cost.
-      watch: called with cost, violation, relative predicted decrease and seconds of each iteration; True ends it.
+      laps: which record the iterations. over: called after each; True ends it.
       stationary: called once the predicted decrease is negligible; returns whether the violation of a trajectory is
         stationary, which ends it. It gets each constraint's multipliers relative to the price, (T+1, rows), in -1 to 1.
       hurried: as in `InteriorPoint.run`.
@@ -228,13 +234,15 @@ def restore(
     def run(first: int, last: int) -> tuple[int, int]:
         return stages.call("restoration", first, last, price, stages.about, work, memory, log)
 
+    def watch(row: tuple[Any, ...], seconds: float) -> bool:
+        cost, violation, predicted, *_ = row
+        laps.record("restoration", cost, optimality=predicted, violation=violation, seconds=seconds)
+        return over()
+
     run(0, 0)
     outcome, at_minimum = RUNNING, False
-    watched = _in_slices(
-        stages.problem, log, run, lambda row, seconds: watch(row[0], row[1], row[2], seconds), hurried=hurried
-    )
-    for _, outcome, over in watched:
-        if outcome == NO_PROGRESS and not over:
+    for _, outcome, ended in _in_slices(stages.problem, log, run, watch, hurried=hurried):
+        if outcome == NO_PROGRESS and not ended:
             shares = stages.by_constraint(work.relative_multipliers.reshape(stages.live.shape))
             at_minimum = stationary(Motion(*map(np.copy, work.plan)), shares)
         if at_minimum or outcome not in (RUNNING, NO_PROGRESS):

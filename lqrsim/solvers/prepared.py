@@ -21,12 +21,11 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import clearance_of, goal_radius_of
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian, meet_constraints
 from lqrsim.solvers.budget import Budget, Laps, Stop
-from lqrsim.solvers.constrained import ConstrainedRun, Known
 from lqrsim.solvers.control_rates import feedback, narrowed, widened
-from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun
+from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun, copied
+from lqrsim.solvers.finish import Known, finish
 from lqrsim.solvers.initial_guess import InitialGuess, resolve
 from lqrsim.solvers.interior_point import WEAK, ActiveSet, Barrier, InteriorPoint, Measures, restore
-from lqrsim.solvers.interior_run import copied
 from lqrsim.solvers.parallel import check_threads
 from lqrsim.solvers.settings import FINE, SmootherSettings
 from lqrsim.solvers.stages import Sizes
@@ -130,9 +129,18 @@ class PreparedSolver(OneVersion):
             if _can_yield(self.problem):
                 return
             # Another solve may need code that this solve did not need.
-            allowed, sizes = run.settings.violation_tolerance(self.problem), stages.sizes(plan)
-            InteriorPoint(stages, plan).run(tolerance=run.final, violation=allowed, most=1)
-            restore(stages, plan, sizes, price=1.0, most=1, watch=lambda *_: True, stationary=lambda *_: False)
+            sizes = stages.sizes(plan)
+            InteriorPoint(stages, plan).run(tolerance=run.final, violation=run.allowed, most=1)
+            restore(
+                stages,
+                plan,
+                sizes,
+                price=1.0,
+                most=1,
+                laps=Laps(run.budget),
+                over=lambda: True,
+                stationary=lambda *_: False,
+            )
 
     @checked
     def check(self, problem: Problem) -> Problem:
@@ -189,7 +197,7 @@ class PreparedSolver(OneVersion):
                 result, ended = finder.find(), finder.laps.ended
                 if finder.may_be_far:
                     best.consider(result)
-                    result, ended = ConstrainedRun(run, Known()).run_to_end(), time.perf_counter()
+                    result, ended = finish(run, Known()), time.perf_counter()
             else:
                 result = _solve(run, best)
                 result = replace(result, cost=_cost_of(run, result.cost, result.plan, result.law))
@@ -288,7 +296,6 @@ class _Finder:
     def __init__(self, run: SolveRun, plan: Motion, best: "_Best", closing: float = 0.0) -> None:
         self._run, self._stages, self._plan, self._best = run, run.stages, plan, best
         self._closing, self._budget = closing, run.budget
-        self._allowed = run.settings.violation_tolerance(run.problem)
         self.laps, self._out_of_time = Laps(run.budget), False  # the last iteration may be an abandoned step
         for function in functions_of(run.problem):
             function.forget()
@@ -319,19 +326,17 @@ class _Neighbour(_Finder):
             return replace(self._best.result, status=Status.NOT_FINITE, detail=detail)
         known = tuple(multipliers.values for multipliers in run.initial_guess.multipliers)
         with np.errstate(all="ignore"):
-            active = ActiveSet(self._stages, self._plan, known, self._allowed)
+            active = ActiveSet(self._stages, self._plan, known, self._run.allowed)
             self.laps.ended = time.perf_counter()
             solved = self._solve(active)
             if not (solved or active.hopeless or self._late(BEGINNING * active.model_seconds)) and budget.left:
                 point = InteriorPoint(self._stages, copied(self._best.result), WEAK, multipliers=known)
-
-                def watch(measures: Measures, seconds: float) -> bool:
-                    measures.record(self.laps, seconds=seconds)
-                    return self._late(budget.log[-1].seconds) or not budget.left
-
-                result = point.run(tolerance=run.final, violation=self._allowed, most=budget.left, watch=watch)
+                result = point.run(
+                    tolerance=run.final, violation=run.allowed, most=budget.left, laps=self.laps,
+                    over=lambda _, seconds: self._late(seconds) or not budget.left,
+                )  # fmt: skip
                 if result.solved or not np.isfinite(active.measures.cost):
-                    active = ActiveSet(self._stages, result.plan, result.multipliers, self._allowed)
+                    active = ActiveSet(self._stages, result.plan, result.multipliers, self._run.allowed)
                     solved = self._solve(active)
             self.laps.ended = time.perf_counter()
             in_time = self.laps.ended + ELSEWHERE * active.model_seconds + self._closing < budget.stop.deadline
@@ -354,7 +359,7 @@ class _Neighbour(_Finder):
             return replace(self._best.result, status=self._unsolved, detail=raised_by(functions_of(problem)))
         plan, gain, cost, values = active.carried_out()
         for term, numbers in zip(problem.constraint_terms, values, strict=True):
-            solved = solved and violation_of(term, numbers) <= allowed_violation(term, self._allowed)
+            solved = solved and violation_of(term, numbers) <= allowed_violation(term, self._run.allowed)
         detail = "no plan near it keeps the constraints" if active.hopeless and not solved else ""
         return RunResult(
             status=Status.CONVERGED if solved else self._unsolved, detail=detail, plan=plan,
@@ -388,14 +393,12 @@ class _Yielding(_Finder):
             point = InteriorPoint(run.stages, self._plan, STRONGER, price=self._price, oldest=OLDEST)
             self.laps.ended = time.perf_counter()
             model_seconds = self.laps.ended - clock
-
-            def watch(measures: Measures, seconds: float) -> bool:
-                measures.record(self.laps, seconds=seconds)
-                return self._late(model_seconds + seconds)  # the next iteration may compute the derivatives anew
-
             if self._late(model_seconds) or not budget.left:
                 return replace(self._best.result, status=self._unsolved)
-            result = point.run(tolerance=run.final, violation=self._allowed, most=budget.left, watch=watch)
+            result = point.run(
+                tolerance=run.final, violation=run.allowed, most=budget.left, laps=self.laps,
+                over=lambda _, seconds: self._late(model_seconds + seconds),  # the next may compute derivatives anew
+            )  # fmt: skip
             law = compiled.law_about(*result.plan, result.gain.copy())
             plan = run.work.roll_out(law, self._plan.states[0])
             reached = run.stages.trial(plan)[0]
@@ -405,7 +408,7 @@ class _Yielding(_Finder):
                 return replace(self._best.result, status=self._unsolved)
         work, status = run.work, Status.CONVERGED if solved else self._unsolved
         violation, detail = work.violation(work.constraint_values(plan)), ""
-        if violation > self._allowed:
+        if violation > self._run.allowed:
             lagrangian = AugmentedLagrangian(run)
             lagrangian.evaluate(plan)
             detail = f"elastic: {lagrangian.worst()}"
@@ -423,7 +426,7 @@ class _Yielding(_Finder):
         pairs = zip(self._run.problem.constraint_terms, self._run.work.constraint_values(plan), strict=True)
         for term, numbers in pairs:
             if not term.yields:
-                missed = max(missed, violation_of(term, numbers) - allowed_violation(term, self._allowed))
+                missed = max(missed, violation_of(term, numbers) - allowed_violation(term, self._run.allowed))
         short = np.where(stages.live & self._yields, np.maximum(-values, 0.0), 0.0)
         paid = float((short * np.where(self._yields, self._prices, 0.0)).sum())
         return not np.isfinite(plan.states).all(), missed, cost + paid
@@ -455,7 +458,7 @@ class _Best:
         )  # fmt: skip
         self.before, self.improved = self.result.cost, False
         # Equalities are kept only within a tolerance.
-        allowed = run.settings.violation_tolerance(run.problem)
+        allowed = run.allowed
         self._none = max((allowed_violation(term, allowed) for term in run.problem.constraint_terms), default=0.0)
         self._negligible = min(allowed, EQUALITY_TOLERANCE)
         self._most = max(self.result.violation, self._none)

@@ -1,9 +1,12 @@
 """`smooth`, iterated LQR smoothing (Sec. V of the paper), and its baseline `ilqr`; both also for many problems.
 
-`strategy.py` describes what `smooth` tries.
+`strategy.py` describes what `smooth` tries. Loops around that (`solve`) find a free duration (`free_duration.py`), put
+right what a plan does between its knots (`between_knots.py`), and leave the last command out of a plan with a
+`control_rate` (`control_rates.py`).
 """
 
 import contextlib
+import functools
 import logging
 from collections.abc import Callable, Iterable
 from concurrent.futures import as_completed
@@ -22,20 +25,25 @@ from lqrsim.problem.derivative_check import check_functions, functions_of
 from lqrsim.problem.noise import Noise
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Quadratic, Status
+from lqrsim.results.solution_parts import Iteration, Quadratic, Status, Trajectory
 from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import assemble
+from lqrsim.solvers.between_knots import between_knots, solve_between_knots
 from lqrsim.solvers.budget import Budget, Callback, Stop, reported
 from lqrsim.solvers.control_rates import solve_with_rates
-from lqrsim.solvers.engine import RunResult, SolveRun
+from lqrsim.solvers.engine import RunResult, SolveRun, copied
+from lqrsim.solvers.free_duration import solve_for_duration
 from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, StartLike, resolve
 from lqrsim.solvers.multistart import STARTS, check_starts
 from lqrsim.solvers.parallel import check_threads, workers
 from lqrsim.solvers.risk import name_risk
 from lqrsim.solvers.settings import Settings, SmootherSettings
-from lqrsim.solvers.strategy import solve
+from lqrsim.solvers.strategy import Search
 
 ILQR_TOLERANCE = 1e-4  # default tolerance of iLQR
+# Refinements of constraints along a plan, of which arms' force limits need two or three: along an outline, which takes
+# this number of iterations without them; then along a plan of this tolerance; and then along plans that have converged.
+REFINEMENTS, OUTLINED, PRELIMINARY = 5, 3, 1e-3
 _log = logging.getLogger("lqrsim")
 
 
@@ -110,7 +118,7 @@ def smooth(
       penalty: the initial penalty of all constraints in the augmented Lagrangian, in cost per square of their unit;
         they then act from the first iteration. It needs a start.
       finish: "newton" leaves the last iterations to Newton's method, or with constraints to the interior point; see
-        `solvers/strategy.py`. None uses the paper's method to the end, with an augmented Lagrangian for constraints. So
+        `solvers/finish.py`. None uses the paper's method to the end, with an augmented Lagrangian for constraints. So
         do `stop="cost"`, noise with constraints and, without constraints, the steps of an MJCF.
       elastic: the price of violating a constraint, in cost per unit, summed over rows and steps. Constraints whose
         multipliers would exceed the price are violated, and the detail says by how much. None: they must hold.
@@ -329,6 +337,83 @@ def _solve_ilqr(problem: Problem, settings: Settings, stop: Stop | None = None) 
     solution = assemble(problem, result, log, solver="ilqr", options=settings.options(guess))
     run.give_back()
     return stop.finish(solution)
+
+
+def solve(problem: Problem, settings: SmootherSettings, stop: Stop | None = None) -> Solution:
+    """Solve one problem; the solution can look at its plan between the knots."""
+    stop = Stop() if stop is None else stop
+    stop.begin(settings.time_limit)
+    # The loops that a problem needs, the innermost first: each solves problems with the one before.
+    solve_part: Callable[..., Solution] = partial(solve_fixed, stop=stop)
+    if problem.duration is not None:
+        solve_part = partial(solve_for_duration, solve=partial(solve_part, trees=False), stop=stop)
+    if problem.accuracy is not None or problem.between_knots:
+        solve_part = partial(solve_between_knots, solve=solve_part, stop=stop)
+    if problem.control_rate is not None:
+        solve_part = partial(solve_with_rates, solve=solve_part)
+    solution = solve_part(problem, settings)
+    substeps = solution.options.get("substeps")  # of dynamics whose single steps may be too coarse to look with
+    seen = replace(problem, dynamics=problem.dynamics.with_substeps(substeps)) if isinstance(substeps, int) else problem
+    vars(solution)["_examine_between_knots"] = functools.cache(partial(between_knots, seen, solution.trajectory))
+    return solution
+
+
+def solve_fixed(problem: Problem, settings: SmootherSettings, stop: Stop, *, trees: bool = True) -> Solution:
+    """Solve a problem of fixed duration, and again with constraints that the plan misses within its periods refined."""
+    stated, original, log = problem, settings, tuple[Iteration, ...]()
+    if any(constraint._rough for constraint in problem.constraints):
+        problem, settings, log = outlined(problem, settings, stop)
+    refinements, preliminary, by_outline = REFINEMENTS, settings is not original, problem is not stated
+    while True:
+        solution = Search(problem, settings, stop).solve(trees=trees)
+        refined = problem._refined(solution.trajectory) if solution.success and refinements and not stop.due else None
+        if log:
+            solution = replace(solution, iterations=(*log, *solution.iterations))
+        log = solution.iterations
+        failed = (
+            solution.status in (Status.INFEASIBLE, Status.STALLED) and np.isfinite(solution.trajectory.states).all()
+        )
+        if failed and by_outline and not stop.due:  # no plan may keep the constraints as they are along the outline
+            problem, settings, _ = outlined(stated, replace(original, start=solution.trajectory, starts=None), stop)
+            by_outline = False
+            continue
+        allowed = original.violation_tolerance(problem)
+        settled = solution.status is Status.COST_CONVERGED and solution.violation <= allowed
+        if refined is None and not (preliminary and solution.success and not settled and not stop.due):
+            return stop.finish(solution)
+        problem, settings = refined or problem, replace(original, start=solution, starts=None)
+        refinements, preliminary, by_outline = refinements - 1, False, False
+
+
+def outlined(
+    problem: Problem, settings: SmootherSettings, stop: Stop
+) -> tuple[Problem, SmootherSettings, tuple[Iteration, ...]]:
+    """The problem with constraints refined along an outline, the settings for a plan to refine them again; iterations.
+
+    With a start, the constraints are refined along the plan that follows from it. Without, the outline is a few
+    iterations without these constraints, and the start of what follows if it does not keep them.
+    """
+    rough = settings
+    if settings.second_order(problem):
+        tolerance, missed = settings.final(problem), settings.violation_tolerance(problem)
+        missed = max(missed, min(constraint._rough for constraint in problem.constraints))
+        rough = replace(settings, tolerance=max(tolerance, PRELIMINARY), constraint_tolerance=missed)
+    if settings.start is not None:
+        return problem, rough, ()
+    free = problem.with_constraints([constraint for constraint in problem.constraints if not constraint._rough])
+    with stop.not_counting():  # compiling
+        guess, budget = resolve(None, free), Budget(min(OUTLINED, settings.max_iterations), stop)
+        check_functions(free, guess.offset[0].copy())
+        run = SolveRun(free, rough, guess, free._start_or_zero, budget)
+    budget.report()
+    with problem.dynamics.solving(stop.threads), stop.reporting("smooth"):
+        run.smooth(OUTLINED)
+    outline, log = Trajectory(*copied(run.work.best), problem.dt), tuple(budget.log)
+    run.give_back()
+    refined = problem._refined(outline) if np.isfinite(outline.states).all() else None
+    if refined is None:
+        return problem, settings, log
+    return refined, replace(rough, start=outline, starts=None) if settings.starts in (None, 1) else rough, log
 
 
 def _settings_from(kind: type[Settings], function: str, options: dict[str, Any]) -> Settings:

@@ -1,51 +1,38 @@
-"""The attempts of `smooth`, in order, until one converges.
+"""The search: the attempts at one problem, in order, until one converges.
 
-`Search.make_attempts` and `Search.choose_start` say what is tried in which order, and when. Loops around these
-(`solve`) find a free duration (`free_duration.py`), put right what a plan does between its knots (`between_knots.py`),
-and leave the last command out of a plan with a `control_rate` (`control_rates.py`).
+`Search.solve` and `Search.choose_start` say what is tried in which order, and when; `finish.py` says what is done from
+one start. The budget of each start is `max_iterations`; all starts share one deadline (`budget.py`). Every answer is
+certified (`certify.py`).
 
-`finish`, for one start
-  without constraints: smoothing; Newton's method once it is near an optimum; damped iterations if smoothing fails
-     (`SolveRun.run_to_end`). If controls have limits: the interior point if controls stay at them, or all else fails.
-  with constraints: the interior point from one plan after another (`constrained.py`).
-  with `finish=None`, `stop="cost"` or noise and constraints: smoothing, and the augmented Lagrangian for constraints
-     (`augmented_lagrangian.py`). Without constraints, the dynamics of an MJCF are left to smoothing, too, which begins
-     in `Search.smooth_or_follow_a_line` for an arm, say: if it fails, a line of states may take the place of the start.
-
-The budget of each start is `max_iterations`; all starts share one deadline (`budget.py`). Every answer is certified
-(`certify.py`).
+Some goals no control comes nearer to: the change of a state with every control of a plan is zero. Such a plan is
+stationary, but says nothing: a box that nothing touches does not move, whatever the weight of its place. `unmoved`
+finds such states, and `Search.push_and_approach` plans that change them.
 """
 
 import contextlib
-import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import declarations
 from lqrsim.kernels.records import Motion
+from lqrsim.problem.constraints import goals_of
 from lqrsim.problem.derivative_check import check_functions
 from lqrsim.problem.problem import Problem
+from lqrsim.problem.quadratic_cost import QuadraticCost
 from lqrsim.results.goal import TOLERANCE, Target
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Candidate, Curvature, Iteration, Status, Trajectory
-from lqrsim.solvers import compiled, multistart, reach
+from lqrsim.results.solution_parts import Candidate, Curvature, Status, Trajectory
+from lqrsim.solvers import compiled, multistart
 from lqrsim.solvers.assembly import assemble, clearance_of
-from lqrsim.solvers.augmented_lagrangian import by_multipliers, damped_from_rollout
-from lqrsim.solvers.between_knots import between_knots, solve_between_knots
 from lqrsim.solvers.budget import Budget, Stop
-from lqrsim.solvers.constrained import ConstrainedRun, Known, alike
-from lqrsim.solvers.control_rates import solve_with_rates
-from lqrsim.solvers.engine import RunResult, SolveRun
-from lqrsim.solvers.free_duration import solve_for_duration
+from lqrsim.solvers.engine import RunResult, SolveRun, copied
+from lqrsim.solvers.finish import Known, finish, from_beside, from_states, refine
 from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resolve
-from lqrsim.solvers.interior_point import STRONG, WEAK
-from lqrsim.solvers.interior_run import OPENING, InteriorRun, copied
-from lqrsim.solvers.multistart import SWAYS, choose, guides, passable, sinusoidal_controls, sinusoidal_name
+from lqrsim.solvers.multistart import FOLLOWED, SWAYS, choose, guides, passable, sinusoidal_controls, sinusoidal_name
 from lqrsim.solvers.risk import name_risk
 from lqrsim.solvers.settings import SmootherSettings
 from lqrsim.solvers.tree import ways_by_trees
@@ -70,204 +57,40 @@ SADDLES, SADDLE_STEPS, SADDLE_DECREASE = 5, (0.3, 0.1, 0.03, 0.01), 1e-9
 PUSHES = 2  # plans of pushes and approaches from which a descent begins
 SAVES = 0.5  # cost of a plan that moves a body, relative to one that does not, with which the search for more ends
 APPROACH = 15  # iterations along an approach; without contacts most converge in three
-# Refinements of constraints along a plan, of which arms' force limits need two or three: along an outline, which takes
-# this number of iterations without them; then along a plan of this tolerance; and then along plans that have converged.
-REFINEMENTS, OUTLINED, PRELIMINARY = 5, 3, 1e-3
 CONSTANT = 3  # constant controls that are tried where the states leave their domain under others
 CALLERS_START = "the given start"  # name of the start that the caller gives
+
+LEFT = 1e-3  # slope of the final cost, relative to the slope at the end of a given plan, that has died away
+# Part of the cost that a change of a state by its size would save, from which on its goal counts as missed.
+MOST_OF = 0.1
+NEARER = 0.3  # part of the way to its goal that a body must be taken
+LEAST_WAY = 0.1  # least way of a joint, relative to the longest, by which its weight along an approach is scaled
+NONE = 1e-9  # change of a state, relative to its size, that counts as none
 
 Finish = Callable[[SolveRun, Known], RunResult]
 
 
-def solve(problem: Problem, settings: SmootherSettings, stop: Stop | None = None) -> Solution:
-    """Solve one problem; the solution can look at its plan between the knots."""
-    stop = Stop() if stop is None else stop
-    stop.begin(settings.time_limit)
-    # The loops that a problem needs, the innermost first: each solves problems with the one before.
-    solve_part: Callable[..., Solution] = partial(solve_fixed, stop=stop)
-    if problem.duration is not None:
-        solve_part = partial(solve_for_duration, solve=partial(solve_part, trees=False), stop=stop)
-    if problem.accuracy is not None or problem.between_knots:
-        solve_part = partial(solve_between_knots, solve=solve_part, stop=stop)
-    if problem.control_rate is not None:
-        solve_part = partial(solve_with_rates, solve=solve_part)
-    solution = solve_part(problem, settings)
-    substeps = solution.options.get("substeps")  # of dynamics whose single steps may be too coarse to look with
-    seen = replace(problem, dynamics=problem.dynamics.with_substeps(substeps)) if isinstance(substeps, int) else problem
-    vars(solution)["_examine_between_knots"] = functools.cache(partial(between_knots, seen, solution.trajectory))
-    return solution
-
-
-def solve_fixed(problem: Problem, settings: SmootherSettings, stop: Stop, *, trees: bool = True) -> Solution:
-    """Solve a problem of fixed duration, and again with constraints that the plan misses within its periods refined."""
-    stated, original, log = problem, settings, tuple[Iteration, ...]()
-    if any(constraint._rough for constraint in problem.constraints):
-        problem, settings, log = outlined(problem, settings, stop)
-    refinements, preliminary, by_outline = REFINEMENTS, settings is not original, problem is not stated
-    while True:
-        solution = _search(problem, settings, stop, trees=trees)
-        refined = problem._refined(solution.trajectory) if solution.success and refinements and not stop.due else None
-        if log:
-            solution = replace(solution, iterations=(*log, *solution.iterations))
-        log = solution.iterations
-        failed = (
-            solution.status in (Status.INFEASIBLE, Status.STALLED) and np.isfinite(solution.trajectory.states).all()
-        )
-        if failed and by_outline and not stop.due:  # no plan may keep the constraints as they are along the outline
-            problem, settings, _ = outlined(stated, replace(original, start=solution.trajectory, starts=None), stop)
-            by_outline = False
-            continue
-        allowed = original.violation_tolerance(problem)
-        settled = solution.status is Status.COST_CONVERGED and solution.violation <= allowed
-        if refined is None and not (preliminary and solution.success and not settled and not stop.due):
-            return stop.finish(solution)
-        problem, settings = refined or problem, replace(original, start=solution, starts=None)
-        refinements, preliminary, by_outline = refinements - 1, False, False
-
-
-def _search(problem: Problem, settings: SmootherSettings, stop: Stop, *, trees: bool) -> Solution:
-    """The answer of a search among starts, for constraints as they are."""
-    with stop.not_counting():  # compiling
-        starts = [(CALLERS_START, settings.start)] if settings.start is not None else guides(problem, settings.starts)
-        first = resolve(starts[0][1], problem).penalised(problem, settings.penalty)
-        check_functions(problem, first.offset[0].copy())
-        runs = [
-            SolveRun(problem, settings, guess, problem._start_or_zero, Budget(settings.max_iterations, stop))
-            for guess in (first, *(resolve(choice, problem) for _, choice in starts[1:]))
-        ]
-    is_plan = settings.start is not None and first.prior is None and first.interior is None
-    given_plan = runs[0].given() if is_plan else None
-    search = Search([(name, run) for (name, _), run in zip(starts, runs, strict=True)], given_plan)
-    with stop.reporting("smooth"):
-        search.make_attempts(trees=trees)
-    solution = search.solution()
-    for run in runs:
-        run.give_back()
-    return solution
-
-
-def outlined(
-    problem: Problem, settings: SmootherSettings, stop: Stop
-) -> tuple[Problem, SmootherSettings, tuple[Iteration, ...]]:
-    """The problem with constraints refined along an outline, the settings for a plan to refine them again; iterations.
-
-    With a start, the constraints are refined along the plan that follows from it. Without, the outline is a few
-    iterations without these constraints, and the start of what follows if it does not keep them.
-    """
-    rough = settings
-    if settings.second_order(problem):
-        tolerance, missed = settings.final(problem), settings.violation_tolerance(problem)
-        missed = max(missed, min(constraint._rough for constraint in problem.constraints))
-        rough = replace(settings, tolerance=max(tolerance, PRELIMINARY), constraint_tolerance=missed)
-    if settings.start is not None:
-        return problem, rough, ()
-    free = problem.with_constraints([constraint for constraint in problem.constraints if not constraint._rough])
-    with stop.not_counting():  # compiling
-        guess, budget = resolve(None, free), Budget(min(OUTLINED, settings.max_iterations), stop)
-        check_functions(free, guess.offset[0].copy())
-        run = SolveRun(free, rough, guess, free._start_or_zero, budget)
-    budget.report()
-    with problem.dynamics.solving(stop.threads), stop.reporting("smooth"):
-        run.smooth(OUTLINED)
-    outline, log = Trajectory(*copied(run.work.best), problem.dt), tuple(budget.log)
-    run.give_back()
-    refined = problem._refined(outline) if np.isfinite(outline.states).all() else None
-    if refined is None:
-        return problem, settings, log
-    return refined, replace(rough, start=outline, starts=None) if settings.starts in (None, 1) else rough, log
-
-
-def finish(run: SolveRun, known: Known) -> RunResult:
-    """Run from one start to the end; certified. `known` has the results of other runs of the same problem."""
-    if run.initial_guess.interior is not None or (run.problem.constraints and run.second_order):
-        return ConstrainedRun(run, known).run_to_end()
-    if not run.problem.constraints:
-        return run.certified(_without_constraints(run))
-    result = by_multipliers(run)
-    # It begins with the optimum without the constraints, which is often the same from all starts, so they count as one.
-    if result.stuck and not known.evidence:
-        known.evidence.append(replace(result, missed=result.violation))
-    return result
-
-
-def refine(run: SolveRun, known: Known) -> RunResult:
-    """Run to the end from the rollout of the first policy, on the same side of the obstacles; certified."""
-    if run.problem.constraints and run.second_order:
-        return ConstrainedRun(run, known, stay=True).run_to_end()
-    result = damped_from_rollout(run)
-    if not result.stuck:
-        return result
-    result = replace(result, missed=result.violation)
-    known.evidence.append(result)
-    return replace(result, status=Status.INFEASIBLE) if result in alike(known.evidence) else result
-
-
-def from_states(run: SolveRun, known: Known) -> RunResult:
-    """The certified result of the interior point from the trajectory of a start, whatever its rollout does."""
-    assert run.initial_guess.trajectory is not None
-    point = InteriorRun(run)
-    result = point.run_from(copied(run.initial_guess.trajectory), STRONG)
-    return run.certified(point.start() if result is None else result)
-
-
-def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult | None:
-    """The certified result from a plan beside a saddle, which costs less; None if it leads back there."""
-    point = InteriorRun(run)
-    if run.problem.constraints:
-        for barrier in WEAK, STRONG:
-            result = point.run_from(copied(plan), barrier)
-            if result is not None and result.success:
-                return run.certified(result)
-        return None
-    law = compiled.law_about(plan.states, plan.controls, saddle.law.gain)
-    beside = point.result(compiled.rollout(run.problem, *law, plan.states[0].copy()))
-    if not beside.cost < saddle.cost:
-        return None
-    run.work.set_best(beside.plan, beside.cost)
-    return run.certified(run.newton(patient=True))
-
-
-def _without_constraints(run: SolveRun) -> RunResult:
-    """Smoothing and Newton's method. The interior point if controls stay at their limits, or all else fails."""
-    problem, budget, space, point = run.problem, run.budget, run.problem.control_coordinates, InteriorRun(run)
-    if not run.second_order or problem.noise_term is not None or not np.isfinite([space.low, space.high]).any():
-        return run.run_to_end()
-    run.smooth(OPENING)
-    controls = run.work.best.controls
-    pressed = ((controls <= space.low) | (controls >= space.high)).any()
-    if run.ending.outcome == declarations.RUNNING and pressed and np.isfinite(run.cost):
-        checkpoint, begin = run.checkpoint(), len(budget.log)
-        result = point.run_from(copied(run.work.best), STRONG)
-        if result is not None and result.success:
-            return result
-        run.go_on(checkpoint, budget.log[begin:])
-    result = run.run_to_end()
-    if result.success or budget.stop.due or budget.left < 2:
-        return result
-    result = result.kept()
-    other = point.run_from(copied(run.work.best if np.isfinite(result.cost) else point.start()), STRONG)
-    if other is None or other.success or not other.cost < result.cost:
-        return other if other is not None and other.success else result
-    other = other.kept()
-    if budget.over:
-        return replace(other, status=result.status, detail=result.detail)
-    run.work.set_best(other.plan, other.cost)
-    return run.newton(detail=result.detail, patient=True)
-
-
 class Search:
-    """Several runs, the most promising of which are finished. The answer must not be worse than the plan `given`."""
+    """Runs from several starts, the most promising of which are finished."""
 
-    def __init__(self, named: list[tuple[str, SolveRun]], given: RunResult | None = None) -> None:
-        first = named[0][1]
-        self._named, self._known, self._given = named, Known(), given
-        self._problem, self._settings, self._start = first.problem, first.settings, first.work.start.copy()
-        self._budget, self._stop, self._threads = first.budget, first.budget.stop, first.budget.stop.threads
-        self._solving = self._threads if len(named) == 1 else 1
-        self._exact = first.second_order  # as all runs of the search
-        self._guided = multistart.path_weight(self._problem) > 0  # whether obstacles in the cost push the plan
-        self._default = self._settings.start is None and self._settings.starts is None  # not by the caller's choice
-        self.tried = not self._settings.safeguard  # whether other starts were tried, as far as they are to be
+    def __init__(
+        self, problem: Problem, settings: SmootherSettings, stop: Stop,
+        starts: Sequence[tuple[str, StartLike | InitialGuess]] = (),
+    ) -> None:  # fmt: skip
+        """By default from the caller's start, or the usual ones."""
+        self._problem, self._settings, self._stop, self._threads = problem, settings, stop, stop.threads
+        self._exact, self._allowed = settings.second_order(problem), settings.violation_tolerance(problem)
+        self._guided = multistart.path_weight(problem) > 0  # whether obstacles in the cost push the plan
+        self._default = settings.start is None and settings.starts is None  # not by the caller's choice
+        self.tried = not settings.safeguard  # whether other starts were tried, as far as they are to be
+        with stop.not_counting():  # compiling
+            if not starts and settings.start is not None:
+                starts = [(CALLERS_START, resolve(settings.start, problem).penalised(problem, settings.penalty))]
+            guesses = [(name, resolve(start, problem)) for name, start in starts or guides(problem, settings.starts)]
+            check_functions(problem, guesses[0][1].offset[0].copy())
+            self._named = [(name, self._another(guess)) for name, guess in guesses]
+        self._solving = self._threads if len(self._named) == 1 else 1
+        self._known = Known()
         self._finished: list[tuple[SolveRun, RunResult]] = []
         self._unmoved_of: tuple[RunResult | None, list[int]] = None, []  # the plan of which `_unmoved` spoke last
         # A plan and states that miss their goal, which no control changes along it; the best plan that brings them
@@ -285,8 +108,21 @@ class Search:
         """The run with the best result so far, and that result."""
         return self._finished[0]
 
-    def make_attempts(self, *, trees: bool) -> None:
-        """Make all attempts in turn, as far as they are called for; `trees` if they may grow."""
+    def solve(self, *, trees: bool) -> Solution:
+        """The answer after all attempts, no worse than a plan that the caller gave; `trees` if they may grow."""
+        begun = [run for _, run in self._named]
+        guess = begun[0].initial_guess
+        is_plan = self._settings.start is not None and guess.prior is None and guess.interior is None
+        given = begun[0].given() if is_plan else None
+        with self._stop.reporting("smooth"):
+            self.make_attempts(given, trees=trees)
+        solution = self._solution()
+        for run in begun:
+            run.give_back()
+        return solution
+
+    def make_attempts(self, given: RunResult | None, *, trees: bool) -> None:
+        """Make all attempts in turn, as far as they are called for."""
         # The attempts after this block also solve problems with other dynamics, and set the number of threads for each.
         with self._problem.dynamics.solving(self._solving):
             self.choose_start()
@@ -303,8 +139,8 @@ class Search:
         alone = self._best_nearer is not None and not self._comes_nearer(self.best[1])  # the best leaves a body alone
         if self._default and self.may_go_on and (alone or not self.best[1].success):
             self.soften_contacts()
-        if self._given is not None:
-            self.keep_given(self._given)
+        if given is not None:
+            self.keep_given(given)
         if not self.best[1].success and self.may_go_on:
             self.alternate_softness()
         if not self.best[1].success and self.has_cheaper_beside and self.may_go_on:
@@ -522,7 +358,7 @@ class Search:
 
     def _cheaper_elsewhere(self, less: float) -> int | None:
         """Number of the cheapest plan that keeps the constraints, if it costs less than the best by this share."""
-        allowed, best = self._settings.violation_tolerance(self._problem), self.best[1].cost
+        allowed, best = self._allowed, self.best[1].cost
         kept = [result.violation <= allowed and np.isfinite(result.cost) for _, result in self._finished]
         costs = np.where(kept, [result.cost for _, result in self._finished], np.inf)
         return int(np.argmin(costs)) if costs.min() < best - less * abs(best) else None
@@ -560,7 +396,7 @@ class Search:
         def consider(name: str, begin: InitialGuess, plan: Motion) -> bool:
             """Keep a plan that changes these states; return whether it takes them nearer to their goal at less cost."""
             cost = compiled.cost_of(problem, *plan)
-            if not (np.isfinite(cost) and reach.differ(plan, before, places)):
+            if not (np.isfinite(cost) and differ(plan, before, places)):
                 return False
             nearer = self._comes_nearer(plan)
             plans.append((not nearer, cost, name, begin))
@@ -568,7 +404,7 @@ class Search:
 
         for name, controls, plan in multistart.pushes(problem):
             consider(name, resolve(controls, problem), plan)
-        for name, through in reach.approaches(problem, before, places):
+        for name, through in approaches(problem, before, places):
             if self._stop.due:
                 break
             run = self._another(resolve(None, through), through)
@@ -593,7 +429,7 @@ class Search:
 
     def _comes_nearer(self, plan: RunResult | Motion) -> bool:
         """Whether a plan brings states nearer to their goal that no control changed along the first plan."""
-        return self._still is not None and reach.comes_nearer(self._problem, plan, *self._still)
+        return self._still is not None and comes_nearer(self._problem, plan, *self._still)
 
     def _is_better(self, result: RunResult) -> bool:
         """Whether a plan is better than the best."""
@@ -605,19 +441,19 @@ class Search:
 
     def _unmoved(self) -> list[int]:
         """The states that miss their goal and that no control changes along the best plan."""
-        best, allowed = self.best[1], self._settings.violation_tolerance(self._problem)
+        best, allowed = self.best[1], self._allowed
         if not np.isfinite(best.cost):
             return []
         if self._unmoved_of[0] is not best:
-            places = reach.unmoved(self._problem, best.states, best.controls, best.cost, allowed)
+            places = unmoved(self._problem, best.states, best.controls, best.cost, allowed)
             self._unmoved_of = best, places
         return self._unmoved_of[1]
 
     def keep_given(self, given: RunResult) -> None:
         """If the best plan is worse than the caller's, or has left what that moved, descend from the caller's plan."""
         run, best = self.best
-        still = reach.differ(best, given, self._unmoved())
-        worsened = still or run.is_worse(best, given) or reach.goal_left(self._problem, best, given)
+        still = differ(best, given, self._unmoved())
+        worsened = still or run.is_worse(best, given) or goal_left(self._problem, best, given)
         if worsened and not self._stop.due:
             run = self._add(guess_from(given, "descent from the given plan"))
             other = self._finish(run, refine)
@@ -661,7 +497,7 @@ class Search:
             return
         (name, widest), *harder = self._soft
         if moved is not None:
-            self._stiffen({f", {moved[0]}": begin}, harder, [], self._budget.left)
+            self._stiffen({f", {moved[0]}": begin}, harder, [], self._named[0][1].budget.left)
             if self.best[1].success or self._stop.due:
                 return
         results = {"": self._keep_softer(name, *self._searched(widest))}
@@ -669,7 +505,7 @@ class Search:
             if not self._stop.due:
                 begin, origin = sinusoidal_controls(widest, side * cycles), f", {sinusoidal_name(side * cycles)}"
                 results[origin] = self._solve_softly(f"{name}{origin}", widest, resolve(begin, widest), LOOK)
-        self._stiffen(results, harder, [name], self._budget.left)
+        self._stiffen(results, harder, [name], self._named[0][1].budget.left)
 
     def alternate_softness(self) -> None:
         """Soften the cheapest plan's contacts a little, stiffen them, and keep its modes, in turn.
@@ -769,7 +605,7 @@ class Search:
         self._offer(run, replace(result, detail=detail), better=result.rank <= self.best[1].rank)
         return True
 
-    def solution(self) -> Solution:
+    def _solution(self) -> Solution:
         chosen, result = self.best
         problem, settings, stop = self._problem, self._settings, self._stop
         if not np.isfinite(result.states).all() and not result.success:
@@ -785,7 +621,7 @@ class Search:
         detail = name_risk(chosen, result) if result.status is Status.RISK_TOO_HIGH else result.detail
         if result.success and (cheapest := self._cheaper_elsewhere(CHEAPER)) is not None:
             detail = "; ".join(filter(None, (detail, self._unfinished(*self._finished[cheapest]))))
-        tolerances = {"tolerance": chosen.final, "constraint_tolerance": settings.violation_tolerance(problem)}
+        tolerances = {"tolerance": chosen.final, "constraint_tolerance": self._allowed}
         begun = self._named[0][1] if settings.start is not None else chosen
         return assemble(
             problem, replace(result, detail=detail), chosen.budget.log, solver="smooth",
@@ -807,8 +643,8 @@ class Search:
         problem, places = self._problem, self._unmoved()
         if not places:
             return result
-        parts = reach.described(problem, result.states, places), self._of_approaches(result), result.detail
-        otherwise = reach.can_change(problem, result.states, places)
+        parts = described(problem, result.states, places), self._of_approaches(result), result.detail
+        otherwise = can_change(problem, result.states, places)
         status = Status.STALLED if result.success and otherwise else result.status
         names = ", ".join(problem.dynamics.state_coordinates.names[i] for i in places)
         remedy = f"leave {names} out of the goal, which no control that was tried changes"
@@ -844,15 +680,15 @@ class Search:
 
     def _searched(self, problem: Problem) -> tuple[SolveRun, RunResult]:
         """The best run of a search for another problem, as far as the choice of a start."""
-        starts = [(name, self._another(resolve(start, problem), problem)) for name, start in guides(problem, None)]
-        search = Search(starts)
+        search = Search(problem, self._settings, self._stop, guides(problem, None))
         with problem.dynamics.solving(search._solving):
             return search.choose_start()
 
     def _another(self, initial_guess: InitialGuess, problem: Problem | None = None) -> SolveRun:
         """A run from another start, perhaps of another problem."""
         budget = Budget(self._settings.max_iterations, self._stop)
-        return SolveRun(problem or self._problem, self._settings, initial_guess, self._start, budget)
+        start = self._problem._start_or_zero
+        return SolveRun(problem or self._problem, self._settings, initial_guess, start, budget)
 
     def _add(self, initial_guess: InitialGuess, name: str | None = None) -> SolveRun:
         """A run from another start that is one of the candidates."""
@@ -962,3 +798,103 @@ def line_of_states(problem: Problem) -> Trajectory:
 def guess_from(result: RunResult, summary: str) -> InitialGuess:
     """The policy of a result as a start."""
     return InitialGuess(result.law.gain.copy(), result.law.offset.copy(), summary)
+
+
+def unmoved(problem: Problem, states: Array, controls: Array, cost: float, allowed: float) -> list[int]:
+    """States that miss their goal, of a constraint by more than `allowed`, and that no control of a plan changes."""
+    end, goal, start = states[-1], problem.goal, states[0]
+    sizes = np.maximum(np.ptp(states, axis=0), 0.0 if goal is None else np.abs(np.nan_to_num(goal - end)))
+    sizes = np.where(sizes > 0, sizes, 1.0)
+    missed = np.abs(_final_cost(problem, end)[1]) * sizes > MOST_OF * abs(cost)
+    for i, number in goals_of(problem.constraints, problem.dynamics).items():
+        missed[i] |= abs(end[i] - number) > allowed
+    if not missed.any():
+        return []
+    space = problem.control_coordinates
+    span = np.subtract(space.high, space.low)
+    span = np.where(np.isfinite(span), span, np.maximum(np.abs(controls).max(axis=0), 1.0))
+    places = np.flatnonzero(missed)
+    pull = np.eye(len(start))[places]
+    for state, control in zip(states[-2::-1], controls[::-1], strict=True):
+        with np.errstate(all="ignore"):
+            a, b, _ = problem.dynamics.linearize(state, control, problem.dt)
+        still = (np.abs(pull @ b) * span).sum(axis=1) <= NONE * sizes[places]
+        places, pull = places[still], (pull @ a)[still]
+        if not len(places):
+            break
+    return places.tolist()
+
+
+def differ(plan: RunResult | Motion, other: RunResult | Motion, places: list[int]) -> bool:
+    """Whether two plans end with different values of these states."""
+    return bool((np.abs(plan.states[-1] - other.states[-1])[places] > NONE).any())
+
+
+def goal_left(problem: Problem, result: RunResult, baseline: RunResult) -> bool:
+    """Whether a plan has gone farther from the goal than a given one, to where the final cost has no slope."""
+    value, slope, _ = _final_cost(problem, result.states[-1])
+    before, steeper, _ = _final_cost(problem, baseline.states[-1])
+    return value > before and float(np.abs(slope).max()) < LEFT * float(np.abs(steeper).max())
+
+
+def _final_cost(problem: Problem, state: Array) -> tuple[float, Array, Array]:
+    """The final cost, its gradient (n,) and its Hessian (n, n)."""
+    n, final = len(state), compiled.compile_problem(problem).final
+    no_control = np.zeros(len(problem.nominal_control))
+    value, gradient, hessian = compiled.quadratic_at(problem, final, state, no_control, problem.steps)
+    return value, gradient[:n], hessian[:n, :n]
+
+
+def missing(problem: Problem, state: Array, places: list[int]) -> Array:
+    """By how much these states of a final state (n,) are short of the goal, (n,); zero for all others."""
+    shortfall, (_, slope, curvature) = np.zeros(len(state)), _final_cost(problem, state)
+    shortfall[places] = -np.linalg.lstsq(curvature[np.ix_(places, places)], slope[places])[0]
+    for i, number in goals_of(problem.constraints, problem.dynamics).items():
+        shortfall[i] = number - state[i] if i in places else 0.0
+    return shortfall
+
+
+def comes_nearer(problem: Problem, plan: RunResult | Motion, other: RunResult, places: list[int]) -> bool:
+    """Whether these states end nearer to their goal in a plan than in another, by a good part of the way."""
+    if not np.isfinite(plan.states[-1]).all():
+        return False
+    ways = [missing(problem, motion.states[-1], places) for motion in (plan, other)]
+    return bool(np.linalg.norm(ways[0]) < (1 - NEARER) * np.linalg.norm(ways[1]))
+
+
+def approaches(problem: Problem, result: RunResult, places: list[int]) -> Iterator[tuple[str, Problem]]:
+    """Problems in which the robot passes through a body that nothing touches, and is drawn along motions that take the
+    body to its goal, in words. Their solutions are starts in which the robot touches the body, whose own goals are left
+    out of the constraints, as it does not move there.
+    """
+    constraints = [part for part in problem.constraints if not part.final_states(problem.dynamics)]
+    shortfall = missing(problem, result.states[-1], places)
+    for words, dynamics, about in problem.dynamics.approaches(result.states, shortfall):
+        drawn = ~np.isnan(about)
+        ways = np.where(drawn, about, -np.inf).max(axis=0) - np.where(drawn, about, np.inf).min(axis=0)
+        ways = np.maximum(ways, LEAST_WAY * ways.max())
+        weights = np.where(drawn[0], FOLLOWED * abs(result.cost) / (problem.steps * ways**2), 0.0)
+        stage = problem.stage_cost + QuadraticCost(
+            drawn[:, :, None] * np.diag(weights), about=np.where(drawn, about, 0.0)
+        )
+        yield words, replace(problem, dynamics=dynamics, constraints=constraints).with_costs(stage_cost=stage)
+
+
+def can_change(problem: Problem, states: Array, places: list[int]) -> bool:
+    """Whether other controls would change one of these states: then the plan is on a plateau, and no optimum."""
+    if any(problem.dynamics.untouched_body(states, i) for i in places):
+        return True
+    gain = np.zeros((problem.steps, len(problem.nominal_control), len(states[0])))
+    for cycles in SWAYS[:2]:
+        other, _ = compiled.rollout(problem, gain, sinusoidal_controls(problem, cycles), states[0].copy())
+        if (np.abs(other - states)[:, places] > NONE).any():  # at any time, for what sways may come back to the end
+            return True
+    return False
+
+
+def described(problem: Problem, states: Array, places: list[int]) -> str:
+    """In words: which states no control changes, and which bodies nothing touches."""
+    names = problem.dynamics.state_coordinates.names
+    text = f"no control changes {' or '.join(names[i] for i in places)} along this plan"
+    bodies = dict.fromkeys(filter(None, (problem.dynamics.untouched_body(states, i) for i in places)))
+    return text + (f": nothing that moves touches {' or '.join(bodies)}" if bodies else "")

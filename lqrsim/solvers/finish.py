@@ -1,8 +1,14 @@
-"""The plans from which a plan that keeps the constraints is sought, in turn; the interior point finishes each.
+"""From one start to the end: the methods that finish a run, and the order in which they are tried.
 
-`ConstrainedRun` says which, when, and in which order. If none of them leads to an optimum, the plan that violates the
-constraints least is the answer. It is INFEASIBLE if two starts lead to plans whose violation is stationary and equally
-large. With the augmented Lagrangian, the evidence is a violation that does not fall while the penalty grows.
+`finish` without constraints: smoothing and Newton's method; the interior point if controls stay at their limits, or all
+else fails. With constraints, the interior point begins from one plan after another (`ConstrainedRun`). If none of them
+leads to an optimum, the plan that violates the constraints least is the answer. It is INFEASIBLE if two starts lead to
+plans whose violation is stationary and equally large. With the augmented Lagrangian (`augmented_lagrangian.py`), the
+evidence is a violation that does not fall while the penalty grows.
+
+A plan of the interior point that converges is a minimum of the augmented Lagrangian with the multipliers found.
+Newton's method on that function finishes the plan. This puts controls exactly at their limits, and gives a policy and
+value functions. Any other plan is rolled out.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,17 +18,52 @@ import numpy as np
 
 from lqrsim.errors import Array
 from lqrsim.kernels import declarations
-from lqrsim.kernels.records import Motion
+from lqrsim.kernels.active_set import AT_LIMIT, FIRMNESS
+from lqrsim.kernels.interior_point import FLAT_BEFORE_END, FLAT_COST
+from lqrsim.kernels.records import Motion, Policy
 from lqrsim.problem.problem import Problem
-from lqrsim.results.solution_parts import Status
-from lqrsim.solvers import augmented_lagrangian
-from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian
+from lqrsim.results.solution_parts import Multipliers, Status, Trajectory
+from lqrsim.solvers import compiled
+from lqrsim.solvers.augmented_lagrangian import (
+    AugmentedLagrangian,
+    by_multipliers,
+    damped_from_rollout,
+    meet_constraints,
+)
 from lqrsim.solvers.budget import Laps
-from lqrsim.solvers.engine import RunResult, SolveRun
-from lqrsim.solvers.interior_point import STRONG, WEAK, Barrier, Restored, restore
-from lqrsim.solvers.interior_run import OPENING, InteriorRun, copied
+from lqrsim.solvers.engine import RunResult, SolveRun, copied
+from lqrsim.solvers.interior_point import (
+    NAME,
+    STRONG,
+    WEAK,
+    Barrier,
+    InteriorPoint,
+    InteriorResult,
+    Measures,
+    Restored,
+    restore,
+)
 from lqrsim.solvers.settings import has_curvature
 from lqrsim.solvers.stages import Sizes
+
+OPENING = 6  # iterations of smoothing before constraints, or limits that controls press against, act
+MOST = 300  # largest number of iterations from one plan
+FAINT = 1e-9  # factor by which penalties are smaller where a plan ends inside: its certificate is that of multipliers
+# What is said where the cost no longer changes, and the gradient does not vanish.
+KINKED = (
+    "the derivatives of the dynamics jump along the plan, as by dry friction, at a contact, at a joint's limit or in a"
+    f" medium at rest, where no gradient vanishes; the cost has not changed by {FLAT_COST:g} of itself in"
+    f" {FLAT_BEFORE_END} iterations, but plans beside it may cost less"
+)
+UNSETTLED = (
+    "no gradient vanishes along the plan, as where a flat side of the robot lies along an obstacle and the derivatives"
+    f" of a distance jump; from two plans the search ended at costs within {FLAT_COST:g} of each other, but plans"
+    " beside them may cost less"
+)
+# Distance from the plan at which derivatives are compared, relative to sizes of states and controls; and the difference
+# that is a jump, relative to the largest derivative: along arms without dry friction it is 1e-5 to 1e-4.
+BESIDE, JUMP = 1e-4, 3e-3
+UPDATES = 5  # largest number of updates of the multipliers, if Newton's last steps violate constraints
 
 EVIDENT = 100.0  # a violation above this many tolerances may be evidence that the constraints are infeasible
 # Iterations of the augmented Lagrangian: from the plan of smoothing; undamped iterations without progress among these;
@@ -34,7 +75,6 @@ DEEP = 0.03  # largest violation by the plan of smoothing with which the interio
 TROUBLED = 4
 GUIDED = 60  # iterations of smoothing before constraints act, with an ObstacleCost
 RESTORED = 150  # iterations of a descent at one price
-RESTORATION = "restoration"  # name of the descent in the log
 PRICES = (1e2, 1e4)  # prices of violating a constraint by its typical size, relative to the cost
 STARTS, ALIKE = 2, 0.05  # starts that must lead to equal violations, and relative difference up to which they are equal
 STATIONARY = 5e-3  # largest remaining gradient, relative to the gradients that cancel
@@ -51,23 +91,281 @@ class Known:
     rows: Array | None = None  # (R,) typical sizes of the constraint rows, in which violations are measured
 
 
-class ConstrainedRun:
+def finish(run: SolveRun, known: Known) -> RunResult:
+    """Run from one start to the end; certified. `known` has the results of other runs of the same problem."""
+    if run.initial_guess.interior is not None or (run.problem.constraints and run.second_order):
+        return ConstrainedRun(run, known).run_to_end()
+    if not run.problem.constraints:
+        return run.certified(_without_constraints(run))
+    result = by_multipliers(run)
+    # It begins with the optimum without the constraints, which is often the same from all starts, so they count as one.
+    if result.stuck and not known.evidence:
+        known.evidence.append(replace(result, missed=result.violation))
+    return result
+
+
+def refine(run: SolveRun, known: Known) -> RunResult:
+    """Run to the end from the rollout of the first policy, on the same side of the obstacles; certified."""
+    if run.problem.constraints and run.second_order:
+        return ConstrainedRun(run, known, stay=True).run_to_end()
+    result = damped_from_rollout(run)
+    if not result.stuck:
+        return result
+    result = replace(result, missed=result.violation)
+    known.evidence.append(result)
+    return replace(result, status=Status.INFEASIBLE) if result in alike(known.evidence) else result
+
+
+def from_states(run: SolveRun, known: Known) -> RunResult:
+    """The certified result of the interior point from the trajectory of a start, whatever its rollout does."""
+    assert run.initial_guess.trajectory is not None
+    point = InteriorRun(run)
+    result = point.run_from(copied(run.initial_guess.trajectory), STRONG)
+    return run.certified(point.start() if result is None else result)
+
+
+def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult | None:
+    """The certified result from a plan beside a saddle, which costs less; None if it leads back there."""
+    point = InteriorRun(run)
+    if run.problem.constraints:
+        for barrier in WEAK, STRONG:
+            result = point.run_from(copied(plan), barrier)
+            if result is not None and result.success:
+                return run.certified(result)
+        return None
+    law = compiled.law_about(plan.states, plan.controls, saddle.law.gain)
+    beside = point.result(compiled.rollout(run.problem, *law, plan.states[0].copy()))
+    if not beside.cost < saddle.cost:
+        return None
+    run.work.set_best(beside.plan, beside.cost)
+    return run.certified(run.newton(patient=True))
+
+
+def _without_constraints(run: SolveRun) -> RunResult:
+    """Smoothing and Newton's method. The interior point if controls stay at their limits, or all else fails."""
+    problem, budget, space, point = run.problem, run.budget, run.problem.control_coordinates, InteriorRun(run)
+    if not run.second_order or problem.noise_term is not None or not np.isfinite([space.low, space.high]).any():
+        return run.run_to_end()
+    run.smooth(OPENING)
+    controls = run.work.best.controls
+    pressed = ((controls <= space.low) | (controls >= space.high)).any()
+    if run.ending.outcome == declarations.RUNNING and pressed and np.isfinite(run.cost):
+        checkpoint, begin = run.checkpoint(), len(budget.log)
+        result = point.run_from(copied(run.work.best), STRONG)
+        if result is not None and result.success:
+            return result
+        run.go_on(checkpoint, budget.log[begin:])
+    result = run.run_to_end()
+    if result.success or budget.stop.due or budget.left < 2:
+        return result
+    result = result.kept()
+    other = point.run_from(copied(run.work.best if np.isfinite(result.cost) else point.start()), STRONG)
+    if other is None or other.success or not other.cost < result.cost:
+        return other if other is not None and other.success else result
+    other = other.kept()
+    if budget.over:
+        return replace(other, status=result.status, detail=result.detail)
+    run.work.set_best(other.plan, other.cost)
+    return run.newton(detail=result.detail, patient=True)
+
+
+class InteriorRun:
+    """The interior point for the problem of a run."""
+
+    idle = False  # whether the last plan did not press against any constraint
+    _flat: RunResult | None = None  # the last result where the cost no longer changed
+
+    def __init__(self, run: SolveRun) -> None:
+        self._run, self._problem, self._budget, self._allowed = run, run.problem, run.budget, run.allowed
+        self._curved = has_curvature(run.problem)
+
+    def run_from(
+        self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = (), stale: int | None = None
+    ) -> RunResult | None:
+        """The result from a plan, or None; `stale` iterations without a new least stationarity end it."""
+        budget, run, result = self._budget, self._run, None
+        if budget.left < 2 or budget.stop.due:
+            return None
+        least, since = np.inf, 0
+
+        def over(measures: Measures, _: float) -> bool:
+            nonlocal least, since
+            since = 0 if measures.stationarity < least else since + 1
+            least = min(least, measures.stationarity)
+            return budget.stop.due or since == stale
+
+        with budget.stop.heeding():
+            point = InteriorPoint(run.stages, plan, barrier, price=run.settings.price, multipliers=multipliers)
+            result = point.run(
+                tolerance=run.final, violation=self._allowed, most=min(MOST, budget.left - 1), near=barrier is WEAK,
+                laps=Laps(budget), over=over, hurried=budget.hurried,
+            )  # fmt: skip
+        return None if result is None else self.finished(result)
+
+    def finished(self, interior: InteriorResult) -> RunResult | None:
+        """Make a result from a plan: by Newton's method if converged, else by a rollout. None if it is not finite."""
+        if not np.isfinite(interior.plan.states).all():
+            return None
+        self.idle = self._is_idle(interior)
+        if interior.solved and (result := self._polished(interior)) is not None and result.success:
+            return result
+        result = self._rolled_out(interior.plan, interior.gain)
+        if not interior.flat or result.violation > self._allowed:
+            return result
+        detail = KINKED if self._jumps(interior) else ""
+        if self._flat is not None and abs(self._flat.cost - result.cost) <= FLAT_COST * abs(result.cost):
+            result, detail = min(self._flat, result, key=lambda flat: flat.cost), detail or UNSETTLED
+        self._flat = result.kept()
+        if detail:
+            interior.measures._replace(cost=result.cost, gap=0.0, violation=result.violation).record(Laps(self._budget))
+            result = replace(result, status=Status.COST_CONVERGED, detail=detail)
+        return result
+
+    def _is_idle(self, interior: InteriorResult) -> bool:
+        """Whether the multipliers of all constraints are remnants of the barrier."""
+        stages = self._run.stages
+        acting = stages.live & (stages.owners >= 0)
+        force = stages.of_constraints(interior.multipliers)
+        sizes = np.broadcast_to(interior.sizes.rows**2 / interior.scale, force.shape)  # infinite far from all obstacles
+        force = np.multiply(force, sizes, out=np.zeros(force.shape), where=force != 0)
+        return bool((~stages.equality & (force < stages.values(interior.plan)))[acting].all())
+
+    def _jumps(self, interior: InteriorResult) -> bool:
+        """Whether derivatives of the dynamics differ beside the plan by more than they do where they are smooth."""
+        dynamics, dt, draws = self._problem.dynamics, self._problem.dt, np.random.default_rng(0)
+
+        def perturbed(numbers: Array, size: Array) -> Array:
+            return numbers + BESIDE * size * draws.choice([-1.0, 1.0], len(numbers))
+
+        for x, u in zip(interior.plan.states[:-1], interior.plan.controls, strict=True):
+            here = np.hstack(dynamics.linearize(x, u, dt)[:2])
+            beside = perturbed(x, interior.sizes.states), perturbed(u, interior.sizes.controls)
+            if np.abs(np.hstack(dynamics.linearize(*beside, dt)[:2]) - here).max() > JUMP * np.abs(here).max():
+                return True
+        return False
+
+    def start(self) -> RunResult:
+        """The rollout of the initial policy."""
+        guess, start = self._run.initial_guess, self._run.work.start
+        law = Policy(guess.gain, guess.offset)
+        return self.result(self._run.work.roll_out(law, start), law)
+
+    def result(self, plan: Motion, law: Policy | None = None) -> RunResult:
+        """The result for a plan that has not converged; without a law, its controls are applied without feedback."""
+        if law is None:
+            law = Policy(np.zeros((*plan.controls.shape, plan.states.shape[1])), plan.controls)
+        cost, _ = self._run.stages.trial(plan)
+        work = self._run.work
+        violation = work.violation(work.constraint_values(plan)) if np.isfinite(plan.states).all() else np.inf
+        cost = cost if np.isfinite(cost) else np.inf
+        return RunResult(status=Status.MAX_ITERATIONS, plan=plan, law=law, cost=cost, violation=violation)
+
+    def without_multipliers(self) -> None:
+        for multipliers in self._run.work.multipliers:
+            multipliers.penalty, multipliers.values[...] = 0.0, 0.0
+
+    def _rolled_out(self, plan: Motion, gain: Array) -> RunResult:
+        """The rollout of a plan with gains about it, or without gains if this violates the constraints less."""
+        laws = [compiled.law_about(*plan, gains) for gains in (gain.copy(), np.zeros_like(gain))]
+        candidates = (self.result(self._run.work.roll_out(law, plan.states[0]), law) for law in laws)
+        return min(candidates, key=lambda result: (not np.isfinite(result.cost), result.violation, result.cost))
+
+    def _polished(self, interior: InteriorResult) -> RunResult | None:
+        """Finish a converged plan by Newton's method; None if its rollout is not finite."""
+        work = self._run.work
+        law = compiled.law_about(interior.plan.states, *self._at_limits(interior))
+        plan = work.roll_out(law, interior.plan.states[0])
+        if not np.isfinite(plan.states).all():
+            return None
+        self._set_multipliers(interior, work.constraint_values(plan), FIRMNESS)
+        work.set_best(plan, cost := self._run.stages.trial(plan)[0])
+        lagrangian = AugmentedLagrangian(self._run)
+        lagrangian.evaluate(work.best)
+        with self._budget.joined_with_last(NAME):
+            result = None
+            for updates in range(1 + UPDATES if self._curved else 0):
+                if updates:
+                    lagrangian.update(growth=1.0)
+                result = self._run.newton(added=lagrangian.added(), least=interior.scale)
+                lagrangian.evaluate(result.plan)
+                if lagrangian.kept or not result.success:
+                    break
+            # Newton's method may fail where no other plan takes as little time.
+            if result is None or not (result.success and lagrangian.kept):
+                work.set_best(plan, cost)
+                result = self._ended_inside(lagrangian, interior)
+        detail = ""
+        if self._run.settings.elastic is not None and result.violation > self._allowed:
+            detail = f"elastic: {lagrangian.worst()}"
+        result = replace(result, detail=detail, multipliers=self._pressing(lagrangian, interior, result))
+        if result.success and lagrangian.kept:
+            return result
+        self.without_multipliers()
+        return replace(result, status=Status.MAX_ITERATIONS)
+
+    def _ended_inside(self, lagrangian: AugmentedLagrangian, interior: InteriorResult) -> RunResult:
+        """The plan in memory as it is: without second derivatives, the interior point ends inside the constraints.
+
+        Penalties give the policy its gains across rows that press. The certificate is that of the multipliers alone.
+        """
+        work, laps = self._run.work, Laps(self._budget)
+        result = self._run.about_plan(Status.CONVERGED)
+        self._set_multipliers(interior, work.constraint_values(work.best), FAINT * FIRMNESS)
+        lagrangian.evaluate(work.best)
+        interior.measures._replace(cost=work.cost, gap=0.0, violation=result.violation).record(laps)
+        return result
+
+    def _at_limits(self, interior: InteriorResult) -> tuple[Array, Array]:
+        """Controls and gains of a converged plan, with controls that press against a limit moved to the limit."""
+        controls, gain = interior.plan.controls.copy(), interior.gain.copy()
+        for side, sign in ((self._run.stages.low, -1.0), (self._run.stages.high, 1.0)):
+            distance = np.abs(side - controls) / interior.sizes.controls
+            force = sign * interior.pressing * interior.sizes.controls / interior.scale
+            pressed = (distance < AT_LIMIT) & (force > distance)
+            controls = np.where(pressed, side, controls)
+            gain[pressed] = 0.0
+        return controls, gain
+
+    def _set_multipliers(self, interior: InteriorResult, values: list[Array], firmness: float) -> None:
+        """Choose multipliers with which the augmented Lagrangian has the interior point's forces at these values."""
+        triples = zip(self._run.work.multipliers, interior.multipliers, values, strict=True)
+        for k, (record, known, numbers) in enumerate(triples):
+            size = interior.sizes.rows[self._run.stages.owners == k]
+            record.penalty = firmness * interior.scale / max(float(np.median(size**2)), 1e-300) if len(size) else 1.0
+            force = known + record.penalty * np.where(np.isfinite(numbers), numbers - record.margin, 0.0)
+            presses = known > record.penalty * (numbers - record.margin)  # other forces are remnants of the barrier
+            acts = np.isfinite(numbers) & (record.term.equality | presses)
+            record.values[...] = np.where(acts, force, 0.0).ravel()
+
+    def _pressing(
+        self, lagrangian: AugmentedLagrangian, interior: InteriorResult, result: RunResult
+    ) -> tuple[Multipliers, ...]:
+        """The multipliers; zero for rows whose margin exceeds their force, which is a remnant of the barrier."""
+        values = self._run.work.constraint_values(result.plan)
+        multipliers = []
+        for k, updated in enumerate(lagrangian.multipliers()):
+            size = interior.sizes.rows[self._run.stages.owners == k]
+            idle = updated.values * size / interior.scale < values[k] / size
+            idle &= not self._problem.constraint_terms[k].equality
+            multipliers.append(replace(updated, values=np.where(idle, 0.0, updated.values)))
+        return tuple(multipliers)
+
+
+class ConstrainedRun(InteriorRun):
     """Tries plans, with `stay` only from the rollout of the first policy, until the interior point converges."""
 
     def __init__(self, run: SolveRun, known: Known, *, stay: bool = False) -> None:
-        self._run, self._problem, self._budget, self._known = run, run.problem, run.budget, known
-        self._point, self._stages, self._guess, self._stay = InteriorRun(run), run.stages, run.initial_guess, stay
-        self._allowed = self._point.allowed
+        super().__init__(run)
+        self._known, self._guess, self._stay = known, run.initial_guess, stay
         self._budget.log[:0] = run.initial_guess.log
         self._best: RunResult | None = None
         self._smoothed: Motion | None = None  # the plan of smoothing without the constraints, once it is known
-        self._curved = has_curvature(run.problem)
         # With an ObstacleCost, smoothing chooses the side on which obstacles are passed.
         self._guided = any(cost.contact_curvature for cost in run.problem.obstacle_costs)
         self._elastic = run.settings.elastic is not None
         if run.settings.penalty is None:
-            self._point.without_multipliers()
-        self._start = self._point.start()  # the rollout of the first policy
+            self.without_multipliers()
+        self._start = self.start()  # the rollout of the first policy
         self._keeps_start = self._guess.trajectory is not None or bool(self._guess.gain.any()) or stay
         feasible = (self._keeps_start or run.settings.start is not None) and self._start.violation <= self._allowed
         self._given = self._start if feasible else None  # the answer must not be worse
@@ -89,14 +387,14 @@ class ConstrainedRun:
         run, budget, start, hard = self._run, self._budget, self._start, not self._elastic
         from_start, multipliers = self._untried, tuple(record.values for record in self._guess.multipliers)
         if self._guess.interior is not None:  # of the search for a free duration: it is only finished
-            yield self._remember(self._point.finish(self._guess.interior))
+            yield self._remember(self.finished(self._guess.interior))
         if budget.over:
             return
         if any(values.any() for values in multipliers):  # the plan of another solution, with its multipliers
             yield self._interior(copied(start), WEAK, multipliers=multipliers)
         if self._stay and self._guided:
             with budget.limited(REFINED):
-                result = augmented_lagrangian.damped_from_rollout(run)
+                result = damped_from_rollout(run)
             yield self._after_multipliers(result)
         if self._keeps_start:  # a trajectory or a policy that the caller gave
             yield self._from_given()
@@ -104,7 +402,7 @@ class ConstrainedRun:
             yield self._from_valley()
         # Where the cost has kinks, as where a flat side of the robot lies along an obstacle, the interior point's
         # measures do not vanish.
-        if not (self._converged or self._curved) and self._point.idle:
+        if not (self._converged or self._curved) and self.idle:
             yield self._from_best_without_constraints()
         if self._smoothed is not None and hard:
             if self._guided:
@@ -116,8 +414,8 @@ class ConstrainedRun:
             self._known.from_start = True
             yield self._at_a_price(copied(start))
         if hard and not (self._converged or self._curved):
-            self._point.without_multipliers()
-            result = augmented_lagrangian.by_multipliers(run)
+            self.without_multipliers()
+            result = by_multipliers(run)
             yield self._remember(result if result.success else None)
         if not self._converged:
             yield self._from_best_without_constraints()
@@ -142,7 +440,7 @@ class ConstrainedRun:
         if best is None or not best.violation <= self._allowed or not np.isfinite(best.cost):
             return None
         best = best.kept()
-        self._point.without_multipliers()
+        self.without_multipliers()
         run.work.set_best(best.plan, best.cost)
         tolerance, run.final = run.final, run.settings.final(self._problem.with_constraints([]))
         result = run.newton(detail=best.detail, patient=True)
@@ -181,7 +479,7 @@ class ConstrainedRun:
 
     def _cuts(self, plan: Motion) -> bool:
         """Whether a plan misses a constraint by more than `DEEP` of the row's typical size."""
-        stages = self._stages
+        stages = self._run.stages
         sizes, numbers = stages.sizes(plan).rows, stages.values(plan)
         missed = np.where(stages.equality, np.abs(numbers), -numbers) / sizes
         return bool((missed[stages.live & (stages.owners >= 0)] > DEEP).any())
@@ -197,7 +495,7 @@ class ConstrainedRun:
         """
         run = self._run
         with self._budget.limited(AUGMENTED):
-            result = augmented_lagrangian.meet_constraints(run, run.result(run.ending), stale=STALE)
+            result = meet_constraints(run, run.result(run.ending), stale=STALE)
         if result.success and not self._curved:
             return self._remember(run.certified(result))
         return self._after_multipliers(result, most=self._start.cost)
@@ -205,7 +503,7 @@ class ConstrainedRun:
     def _after_multipliers(self, result: RunResult, *, most: float = np.inf) -> RunResult | None:
         """The interior point from the last plan of the method of multipliers, unless it costs more than `most`."""
         plan = copied(result)
-        self._point.without_multipliers()
+        self.without_multipliers()
         usable = np.isfinite(result.cost) and result.cost <= most and np.isfinite(plan.states).all()
         if self._budget.stop.due or not usable:
             return None
@@ -222,7 +520,7 @@ class ConstrainedRun:
             if priced is None:
                 return None
             plan = priced.plan
-            self._remember(self._point.result(plan))
+            self._remember(self.result(plan))
             if priced.stationary:
                 return None
             if priced.near or price == PRICES[-1]:
@@ -236,13 +534,7 @@ class ConstrainedRun:
         return None
 
     def _restore(self, plan: Motion, price: float) -> Restored | None:
-        budget, laps, restored = self._budget, Laps(self._budget), None
-
-        def watch(cost: float, violation: float, predicted: float, seconds: float) -> bool:
-            laps.record(RESTORATION, cost, optimality=predicted, violation=violation, seconds=seconds)
-            return budget.stop.due
-
-        sizes = self._stages.sizes(plan)
+        budget, sizes, restored = self._budget, self._run.stages.sizes(plan), None
         if self._known.rows is None:
             self._known.rows = sizes.rows
         sizes = sizes._replace(rows=self._known.rows)
@@ -250,14 +542,15 @@ class ConstrainedRun:
             return None
         with budget.stop.heeding():
             restored = restore(
-                self._stages, plan, sizes, price=price, most=min(RESTORED, budget.left - 1), watch=watch,
-                stationary=lambda plan, shares: self._keep_evidence(plan, shares, sizes), hurried=budget.hurried,
+                self._run.stages, plan, sizes, price=price, most=min(RESTORED, budget.left - 1), laps=Laps(budget),
+                over=lambda: budget.stop.due, hurried=budget.hurried,
+                stationary=lambda plan, shares: self._keep_evidence(plan, shares, sizes),
             )  # fmt: skip
         return restored
 
     def _keep_evidence(self, plan: Motion, shares: list[Array], sizes: Sizes) -> bool:
         """Whether the violation of a plan is stationary; if so, the plan is kept as evidence."""
-        result = self._point.result(plan)
+        result = self.result(plan)
         if not result.violation > EVIDENT * self._allowed:
             return False
         new_evidence = evidence(self._run, result, shares, sizes)
@@ -268,7 +561,7 @@ class ConstrainedRun:
     def _interior(
         self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = (), stale: int | None = None
     ) -> RunResult | None:
-        return self._remember(self._point.run_from(plan, barrier, multipliers=multipliers, stale=stale))
+        return self._remember(self.run_from(plan, barrier, multipliers=multipliers, stale=stale))
 
     def _remember(self, result: RunResult | None) -> RunResult | None:
         if result is not None and (self._best is None or result.rank < self._best.rank):
@@ -338,7 +631,7 @@ def _violation_slopes(
     the violated rows alone; and the rows in words, each with its fraction.
     """
     problem, work, states, controls = run.problem, run.work, plan.states, plan.controls
-    allowed = run.settings.violation_tolerance(problem)
+    allowed = run.allowed
     steps, joint = len(controls), states.shape[1] + controls.shape[1]
     slopes, alone, missed = np.zeros((steps + 1, joint)), np.zeros((steps + 1, joint)), 0.0
     holding: list[tuple[float, str]] = []
