@@ -61,10 +61,10 @@ from .simulation.plant import Plant as Plant
 from .simulation.plant_check import check_plant as check_plant
 from .simulation.uncertainty_of import uncertainty_of as uncertainty_of
 from .solvers.gradients import gradients as gradients
-from .solvers.initial_guess import InitialPrior as InitialPrior
 from .solvers.prepared import prepare as prepare
 from .solvers.risk import largest_risk as largest_risk
 from .solvers.risk import sample_costs as sample_costs
+from .solvers.settings import InitialPrior as InitialPrior
 from .solvers.smoother import ilqr as ilqr
 from .solvers.smoother import ilqr_many as ilqr_many
 from .solvers.smoother import smooth as smooth

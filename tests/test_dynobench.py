@@ -17,7 +17,7 @@ from scipy.optimize import minimize
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.solvers import free_duration
-from lqrsim.solvers.ways import Way
+from lqrsim.solvers.multistart import Way
 
 BY_ROBOT = {case.robot: case for case in CASES.values()}
 PARKING, EMPTY = CASES["unicycle1_v0/parallelpark_0"], CASES["quad2d_v0/empty_0"]

@@ -17,8 +17,7 @@ from shooting import Shooting
 import lqrsim as ls
 from lqrsim.kernels.records import Motion
 from lqrsim.results.solution_parts import Iteration, Status
-from lqrsim.solvers.interior_point import STRONG, InteriorPoint
-from lqrsim.solvers.stages import Stages
+from lqrsim.solvers.stages import STRONG, InteriorPoint, Stages
 
 DT = 0.1
 # A state, a speed, a control and the cost in another unit: by how much their numbers are larger.

@@ -92,10 +92,8 @@ from lqrsim.solvers.between_knots import WithinPeriods
 from lqrsim.solvers.budget import Budget
 from lqrsim.solvers.certify import no_value
 from lqrsim.solvers.engine import SolveRun
-from lqrsim.solvers.initial_guess import resolve
-from lqrsim.solvers.interior_point import InteriorPoint, Measures
-from lqrsim.solvers.settings import SmootherSettings
-from lqrsim.solvers.stages import Stages
+from lqrsim.solvers.settings import SmootherSettings, resolve
+from lqrsim.solvers.stages import InteriorPoint, Measures, Stages
 
 MEMORY = 1 << 20  # numbers from which an array is memory at an address, which has no end
 MADE: dict[Any, Any] = {}  # types, hash of the IR, and returned type of what was compiled, by all that it depends on

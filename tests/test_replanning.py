@@ -21,9 +21,8 @@ from lqrsim.control.replanner import ActivePlan, ReplanLog
 from lqrsim.errors import Array
 from lqrsim.solvers.budget import Budget
 from lqrsim.solvers.engine import SolveRun
-from lqrsim.solvers.initial_guess import resolve
 from lqrsim.solvers.prepared import _Best
-from lqrsim.solvers.settings import SmootherSettings
+from lqrsim.solvers.settings import SmootherSettings, resolve
 
 STEPS, DT = 20, 0.1
 

@@ -15,7 +15,7 @@ from lqrsim.errors import Array
 from lqrsim.kernels import declarations
 from lqrsim.results.solution_parts import Status
 from lqrsim.solvers.engine import Ending, SolveRun
-from lqrsim.solvers.initial_guess import StartLike
+from lqrsim.solvers.settings import StartLike
 
 FORMS = ("dual", "primal")
 

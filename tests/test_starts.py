@@ -14,7 +14,7 @@ import lqrsim.gym
 from lqrsim.cli import main
 from lqrsim.scenarios import solutions
 from lqrsim.scenarios.references import resolve
-from lqrsim.solvers import initial_guess
+from lqrsim.solvers import settings
 from lqrsim.view import viewer
 
 OWN = """
@@ -242,11 +242,11 @@ def test_the_hash_is_of_everything_that_is_begun_with(
     differential_drive: ls.Scenario, drive_solution: ls.Solution
 ) -> None:
     problem = differential_drive.problem
-    digests = [initial_guess.resolve(make(drive_solution), problem).digest for make in CHANGES.values()]
-    again = [initial_guess.resolve(make(drive_solution), problem).digest for make in CHANGES.values()]
+    digests = [settings.resolve(make(drive_solution), problem).digest for make in CHANGES.values()]
+    again = [settings.resolve(make(drive_solution), problem).digest for make in CHANGES.values()]
     assert digests == again
     assert len(set(digests)) == len(CHANGES)
-    policy = initial_guess.resolve(drive_solution.policy, problem)  # all that is left without the cost-to-go
+    policy = settings.resolve(drive_solution.policy, problem)  # all that is left without the cost-to-go
     assert policy.digest == digests[list(CHANGES).index("no cost-to-go")]
     made = dataclasses.replace(differential_drive, start=lambda problem: drive_solution.trajectory)
     assert solutions.digest_of_start(made) == digests[list(CHANGES).index("its plan")]

@@ -12,8 +12,8 @@ from sampling import examples
 import lqrsim as ls
 from lqrsim.kernels.records import Motion
 from lqrsim.results.solution_parts import Status
+from lqrsim.solvers.multistart import _other_axes, ways
 from lqrsim.solvers.stages import Stages
-from lqrsim.solvers.ways import _other_axes, ways
 
 PLANE = {"x": "m", "y": "m", "a": "rad"}
 FALLING = {**PLANE, "vx": "m/s", "vy": "m/s", "w": "rad/s"}

@@ -13,8 +13,7 @@ from numpy.random import Generator
 import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.kernels.records import Motion
-from lqrsim.solvers.interior_point import ActiveSet, Barrier, InteriorPoint, InteriorResult, Measures
-from lqrsim.solvers.stages import Stages
+from lqrsim.solvers.stages import ActiveSet, Barrier, InteriorPoint, InteriorResult, Measures, Stages
 from paper.common import numbers
 
 ASIDE = (1e-2, 1e-3, 1e-4)  # of what states and controls change by: how far from the optimum it settles from, in turn

@@ -19,7 +19,7 @@ from lqrsim.commands import console
 from lqrsim.commands.options import ControllerName, DesignSet, Folder, Json, optional, options_of, refuse, stated
 
 if TYPE_CHECKING:
-    from lqrsim.solvers.initial_guess import StartLike
+    from lqrsim.solvers.settings import StartLike
 
 
 @dataclass(frozen=True, kw_only=True)

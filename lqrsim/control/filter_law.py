@@ -24,7 +24,7 @@ from lqrsim.results.solution import Plan
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import clearance_of
-from lqrsim.solvers.initial_guess import InitialGuess
+from lqrsim.solvers.settings import InitialGuess
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,9 +28,9 @@ from lqrsim.results.coordinates import Spaces, check_same_system, spaces_of
 from lqrsim.results.solution import Plan, Replan
 from lqrsim.results.solution_parts import Horizon
 from lqrsim.solvers import compiled
-from lqrsim.solvers.initial_guess import InitialGuess
-from lqrsim.solvers.parallel import workers
+from lqrsim.solvers.budget import workers
 from lqrsim.solvers.prepared import prepare
+from lqrsim.solvers.settings import InitialGuess
 
 Changes = Annotated[Callable[[float, Problem], Problem], Want("a function of the time and the problem")]
 LONGEST = 1e12  # control periods; more count as that many

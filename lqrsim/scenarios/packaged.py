@@ -21,7 +21,7 @@ from lqrsim.scenes.scene import Scene, load_scene
 from lqrsim.simulation.disturbances import ControlNoise, Disturbance, ForceNoise, MeasurementNoise, Push
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.simulator import Simulator
-from lqrsim.solvers.initial_guess import InitialPrior, StartLike, is_function, resolve
+from lqrsim.solvers.settings import InitialPrior, StartLike, is_function, resolve
 
 
 @checked

@@ -18,7 +18,7 @@ from lqrsim.results.save_load import load
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenarios.packaged import Scenario
-from lqrsim.solvers.initial_guess import InitialPrior, is_function, resolve
+from lqrsim.solvers.settings import InitialPrior, is_function, resolve
 from lqrsim.solvers.smoother import ilqr, smooth
 from lqrsim.versions import other_lqrsim
 

@@ -29,7 +29,7 @@ from lqrsim.simulation.disturbances import Disturbance, as_disturbances
 from lqrsim.simulation.effects import BeliefReadings, Effects, MakeGenerator, Readings, seeded
 from lqrsim.simulation.physics import AnyPhysics, MujocoPhysics, SimulatorPhysics, steps_per_frame
 from lqrsim.simulation.plant import Plant
-from lqrsim.solvers.parallel import check_threads
+from lqrsim.solvers.budget import check_threads
 from lqrsim.versions import versions
 
 MOST_STEPS = 100_000_000  # physics steps in a run; they take minutes to hours

@@ -24,7 +24,7 @@ from lqrsim.problem.problem import Problem
 from lqrsim.results.solution_parts import Moments, Multipliers, Status
 from lqrsim.solvers.compiled import ConstraintMultipliers
 from lqrsim.solvers.engine import RunResult, SolveRun
-from lqrsim.solvers.initial_guess import InitialGuess
+from lqrsim.solvers.settings import InitialGuess
 
 INITIAL = 8.0  # initial penalty, relative to the cost of changing the constraint's value
 GROWTH, LARGEST = 5.0, 1e4  # factor by which the penalty grows, and largest total factor
@@ -176,7 +176,7 @@ def _damped(
     return _rounds(run, lagrangian, "the undamped method failed with the constraints")
 
 
-def damped_from_rollout(run: SolveRun) -> RunResult:
+def damped_to_end(run: SolveRun) -> RunResult:
     """Run to the end, only by steps that lower the cost, from the rollout of the first policy; certified.
 
     The plan thus stays in its homotopy class, which undamped iterations would leave.

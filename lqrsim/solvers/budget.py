@@ -1,10 +1,11 @@
-"""The budget of a solve: time, iterations, and requests by the caller to stop."""
+"""The budget of a solve: time, iterations, threads, and requests by the caller to stop."""
 
 import contextlib
 import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -12,6 +13,9 @@ import numpy as np
 
 from lqrsim.annotations import Want
 from lqrsim.codegen.compiled_module import compilations
+from lqrsim.codegen.user_functions import UserFunction
+from lqrsim.errors import check_count
+from lqrsim.machine import processors
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Iteration, Status
 
@@ -22,6 +26,7 @@ ATTENTION = 0.1  # s, after which compiled code returns to check for Ctrl-C
 SILENT = 2.0  # s without a message after which a solve reports its progress; later reports come at growing intervals
 SELDOM = 60.0  # s
 SHORTEST = 1e-3  # s, the least time between two looks at what is reported
+MOST_THREADS = 1024
 NOTED = 10.0  # compiling is mentioned if it takes longer than the time limit divided by this
 
 
@@ -299,3 +304,23 @@ def reported(
       begun: time at which the activity began, on the same clock; by default now.
     """
     return _watch.watching(_Activity(what, progress, called, time.perf_counter() if begun is None else begun))
+
+
+@contextlib.contextmanager
+def workers(threads: int, functions: Iterable[UserFunction]) -> Iterator[ThreadPoolExecutor]:
+    """A pool of threads. After an error or Ctrl-C plain Python functions are told to stop; compiled code ends soon."""
+    with ThreadPoolExecutor(threads, thread_name_prefix="lqrsim") as pool:
+        try:
+            yield pool
+        except BaseException:
+            for function in functions:
+                function.stopped.set()
+            pool.shutdown(wait=True, cancel_futures=True)
+            for function in functions:
+                function.stopped.clear()
+            raise
+
+
+def check_threads(threads: int | None) -> int:
+    """Check a number of threads; by default the number of processors. Raises InputError."""
+    return processors() if threads is None else check_count("threads", threads, at_most=MOST_THREADS)

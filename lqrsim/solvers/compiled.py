@@ -15,13 +15,7 @@ from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import numbers_of
 from lqrsim.errors import Array
-from lqrsim.kernels import (
-    augmented_lagrangian,
-    iterations,
-    linear_algebra,
-    model_functions,
-    records,
-)
+from lqrsim.kernels import augmented_lagrangian, iterations, linear_algebra, model_functions, records
 from lqrsim.kernels.declarations import FIRST, MARGIN, MULTIPLIERS, PENALTY, PRICE, ROWS
 from lqrsim.kernels.records import CostModel, DynamicsModel, Motion, NoiseModel, Policy, ProblemModel
 from lqrsim.problem.constraints import ConstraintTerm

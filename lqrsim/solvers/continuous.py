@@ -32,8 +32,8 @@ from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Iteration, Quadratic, Status
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Callback
-from lqrsim.solvers.initial_guess import InitialPrior
 from lqrsim.solvers.linear_quadratic import WEIGH_MORE, Stage, check_end, definite
+from lqrsim.solvers.settings import InitialPrior
 
 NO_MINIMUM, FLAT = "S + Sbar is not positive definite", "R is not positive definite"
 # Largest number of evaluations of one right-hand side, a few seconds. A trajectory that needs more diverges or is far

@@ -31,8 +31,7 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import clearance_of, parts_of
 from lqrsim.solvers.budget import Budget
 from lqrsim.solvers.engine import SolveRun
-from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, is_function, resolve
-from lqrsim.solvers.settings import Settings, SmootherSettings
+from lqrsim.solvers.settings import InitialGuess, InitialPrior, Settings, SmootherSettings, is_function, resolve
 
 P = TypeVar("P", Solution, Replan)
 S = TypeVar("S", bound=Settings)

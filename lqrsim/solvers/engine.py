@@ -33,8 +33,7 @@ from lqrsim.results.solution_parts import (
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import ATTENTION, Budget
 from lqrsim.solvers.certify import CANCELLATION, FLAT, SLACK, certificate_of, curvature_at, faults, no_value
-from lqrsim.solvers.initial_guess import InitialGuess
-from lqrsim.solvers.settings import INSIDE, SmootherSettings, has_curvature
+from lqrsim.solvers.settings import INSIDE, InitialGuess, SmootherSettings, has_curvature
 from lqrsim.solvers.stages import Pool, Stages
 
 _METHODS = {getattr(declarations, name): name.lower() for name in ("SMOOTH", "DAMPED", "REJECTED", "ILQR", "NEWTON")}

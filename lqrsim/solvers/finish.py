@@ -24,27 +24,11 @@ from lqrsim.kernels.records import Motion, Policy
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution_parts import Multipliers, Status, Trajectory
 from lqrsim.solvers import compiled
-from lqrsim.solvers.augmented_lagrangian import (
-    AugmentedLagrangian,
-    by_multipliers,
-    damped_from_rollout,
-    meet_constraints,
-)
+from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian, by_multipliers, damped_to_end, meet_constraints
 from lqrsim.solvers.budget import Laps
 from lqrsim.solvers.engine import RunResult, SolveRun, copied
-from lqrsim.solvers.interior_point import (
-    NAME,
-    STRONG,
-    WEAK,
-    Barrier,
-    InteriorPoint,
-    InteriorResult,
-    Measures,
-    Restored,
-    restore,
-)
 from lqrsim.solvers.settings import has_curvature
-from lqrsim.solvers.stages import Sizes
+from lqrsim.solvers.stages import NAME, STRONG, WEAK, Barrier, InteriorPoint, InteriorResult, Measures, Sizes, restore
 
 OPENING = 6  # iterations of smoothing before constraints, or limits that controls press against, act
 MOST = 300  # largest number of iterations from one plan
@@ -108,7 +92,7 @@ def refine(run: SolveRun, known: Known) -> RunResult:
     """Run to the end from the rollout of the first policy, on the same side of the obstacles; certified."""
     if run.problem.constraints and run.second_order:
         return ConstrainedRun(run, known, stay=True).run_to_end()
-    result = damped_from_rollout(run)
+    result = damped_to_end(run)
     if not result.stuck:
         return result
     result = replace(result, missed=result.violation)
@@ -394,7 +378,7 @@ class ConstrainedRun(InteriorRun):
             yield self._interior(copied(start), WEAK, multipliers=multipliers)
         if self._stay and self._guided:
             with budget.limited(REFINED):
-                result = damped_from_rollout(run)
+                result = damped_to_end(run)
             yield self._after_multipliers(result)
         if self._keeps_start:  # a trajectory or a policy that the caller gave
             yield self._from_given()
@@ -515,8 +499,20 @@ class ConstrainedRun(InteriorRun):
         If the descent makes no progress at one price, a start that keeps the constraints, such as standing still, is
         tried before the next price.
         """
+        run, budget = self._run, self._budget
         for price in PRICES:
-            priced = self._restore(plan, price)
+            sizes, priced = run.stages.sizes(plan), None
+            if self._known.rows is None:
+                self._known.rows = sizes.rows
+            sizes = sizes._replace(rows=self._known.rows)
+            if budget.left < 2 or budget.stop.due:
+                return None
+            with budget.stop.heeding():
+                priced = restore(
+                    run.stages, plan, sizes, price=price, most=min(RESTORED, budget.left - 1), laps=Laps(budget),
+                    over=lambda: budget.stop.due, hurried=budget.hurried,
+                    stationary=lambda plan, shares, sizes=sizes: self._keep_evidence(plan, shares, sizes),
+                )  # fmt: skip
             if priced is None:
                 return None
             plan = priced.plan
@@ -532,21 +528,6 @@ class ConstrainedRun(InteriorRun):
             if result is not None and result.success:
                 return result
         return None
-
-    def _restore(self, plan: Motion, price: float) -> Restored | None:
-        budget, sizes, restored = self._budget, self._run.stages.sizes(plan), None
-        if self._known.rows is None:
-            self._known.rows = sizes.rows
-        sizes = sizes._replace(rows=self._known.rows)
-        if budget.left < 2 or budget.stop.due:
-            return None
-        with budget.stop.heeding():
-            restored = restore(
-                self._run.stages, plan, sizes, price=price, most=min(RESTORED, budget.left - 1), laps=Laps(budget),
-                over=lambda: budget.stop.due, hurried=budget.hurried,
-                stationary=lambda plan, shares: self._keep_evidence(plan, shares, sizes),
-            )  # fmt: skip
-        return restored
 
     def _keep_evidence(self, plan: Motion, shares: list[Array], sizes: Sizes) -> bool:
         """Whether the violation of a plan is stationary; if so, the plan is kept as evidence."""

@@ -25,12 +25,10 @@ from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory
 from lqrsim.solvers.budget import Budget, Laps, Stop
-from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resampled, resolve
-from lqrsim.solvers.interior_point import MEDIUM, STRONG, WEAK, Barrier, InteriorPoint, InteriorResult
-from lqrsim.solvers.settings import SmootherSettings
-from lqrsim.solvers.stages import Stages
+from lqrsim.solvers.multistart import Way, ways
+from lqrsim.solvers.settings import InitialGuess, SmootherSettings, StartLike, resampled, resolve
+from lqrsim.solvers.stages import MEDIUM, STRONG, WEAK, Barrier, InteriorPoint, InteriorResult, Stages
 from lqrsim.solvers.tree import ways_by_trees
-from lqrsim.solvers.ways import Way, ways
 
 # The added state, and the parameter to which it is relative; with underscores after them if the system has such names.
 STATE, STATED = "duration", "stated_duration"

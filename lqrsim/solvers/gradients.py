@@ -24,8 +24,8 @@ from lqrsim.kernels.records import Motion
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Curvature, Status
+from lqrsim.solvers.budget import check_threads
 from lqrsim.solvers.certify import AT_ZERO, HELD
-from lqrsim.solvers.parallel import check_threads
 from lqrsim.solvers.stages import Stages
 from lqrsim.versions import other_lqrsim
 

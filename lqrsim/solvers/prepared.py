@@ -20,15 +20,12 @@ from lqrsim.results.solution_parts import Iteration, Quadratic, Status, Trajecto
 from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import clearance_of, goal_radius_of
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian, meet_constraints
-from lqrsim.solvers.budget import Budget, Laps, Stop
+from lqrsim.solvers.budget import Budget, Laps, Stop, check_threads
 from lqrsim.solvers.control_rates import feedback, narrowed, widened
 from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun, copied
 from lqrsim.solvers.finish import Known, finish
-from lqrsim.solvers.initial_guess import InitialGuess, resolve
-from lqrsim.solvers.interior_point import WEAK, ActiveSet, Barrier, InteriorPoint, Measures, restore
-from lqrsim.solvers.parallel import check_threads
-from lqrsim.solvers.settings import FINE, SmootherSettings
-from lqrsim.solvers.stages import Sizes
+from lqrsim.solvers.settings import FINE, InitialGuess, SmootherSettings, resolve
+from lqrsim.solvers.stages import WEAK, ActiveSet, Barrier, InteriorPoint, Measures, Sizes, restore
 
 SLOPES = 1e-6  # slope of the Lagrangian relative to the cost; the predicted decrease of cost is about its square
 COARSE = 1e-2  # the same where constraints give way, of plans of which a small part is carried out

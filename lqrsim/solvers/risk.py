@@ -13,8 +13,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Budget
 from lqrsim.solvers.engine import RunResult, SolveRun
-from lqrsim.solvers.initial_guess import resolve
-from lqrsim.solvers.settings import SmootherSettings
+from lqrsim.solvers.settings import SmootherSettings, resolve
 
 DIGITS = 1e-12  # relative accuracy of the bisection
 MOST_TRIALS = 10_000_000

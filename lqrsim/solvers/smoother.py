@@ -29,15 +29,13 @@ from lqrsim.results.solution_parts import Iteration, Quadratic, Status, Trajecto
 from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import assemble
 from lqrsim.solvers.between_knots import between_knots, solve_between_knots
-from lqrsim.solvers.budget import Budget, Callback, Stop, reported
+from lqrsim.solvers.budget import Budget, Callback, Stop, check_threads, reported, workers
 from lqrsim.solvers.control_rates import solve_with_rates
 from lqrsim.solvers.engine import RunResult, SolveRun, copied
 from lqrsim.solvers.free_duration import solve_for_duration
-from lqrsim.solvers.initial_guess import InitialGuess, InitialPrior, StartLike, resolve
 from lqrsim.solvers.multistart import STARTS, check_starts
-from lqrsim.solvers.parallel import check_threads, workers
 from lqrsim.solvers.risk import name_risk
-from lqrsim.solvers.settings import Settings, SmootherSettings
+from lqrsim.solvers.settings import InitialGuess, InitialPrior, Settings, SmootherSettings, StartLike, resolve
 from lqrsim.solvers.strategy import Search
 
 ILQR_TOLERANCE = 1e-4  # default tolerance of iLQR

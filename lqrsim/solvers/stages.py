@@ -1,28 +1,41 @@
-"""The stages of a problem as quadratic models about a plan, and the step to the minimum of these models.
+"""The stages of a problem as quadratic models about a plan, and the methods of `kernels/` that step on them.
 
 All constraints and control limits are rows of numbers, which must be >= 0 for an inequality and = 0 for an equality.
-The plan need not satisfy the dynamics; a step closes the gaps between its states. The users of the stages decide what
-to do with the rows: the interior point, the active set, and the restoration.
+The plan need not satisfy the dynamics; a step closes the gaps between its states. What to do with the rows is left to
+the methods: the interior point, the active set, and the restoration. The interior point and the restoration run in
+slices between which their caller is told, an active set in pieces short enough for a deadline.
 """
 
 import functools
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from lqrsim.codegen.compiled_module import Call, in_c_order, module_of
 from lqrsim.codegen.sources import source_of
+from lqrsim.codegen.user_functions import interrupt_of
 from lqrsim.errors import Array
-from lqrsim.kernels import iterations, records
-from lqrsim.kernels.interior_point import LATELY
-from lqrsim.kernels.records import ACTIVE_SET, INTERIOR, RESTORATION, Motion, StructuredArray, zeros_of
+from lqrsim.kernels import active_set, iterations, records
+from lqrsim.kernels.declarations import CONVERGED, NO_PROGRESS, NOT_FINITE, RUNNING
+from lqrsim.kernels.interior_point import BEGIN, CLOSE, FLAT_BEFORE_END, ITERATE, LATELY, POLISH, SCALE
+from lqrsim.kernels.records import Motion, StructuredArray, zeros_of
 from lqrsim.kernels.stages import CONTROL, EQUALITY, INEQUALITY, LIMIT, LINEAR, RANGE, SIDE, SIGN
+from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import FixedState, Problem
+from lqrsim.results.solution_parts import Multipliers, Trajectory
 from lqrsim.solvers import compiled
+from lqrsim.solvers.budget import ATTENTION, Laps
+from lqrsim.solvers.settings import INSIDE
 
 MOST_KEPT, LARGEST_KEPT = 16, 8 * 1024 * 1024  # memories that are kept for later solves, and largest size in bytes
+# Iterations in which the cost has changed by less than rounding, relative to itself, so that no slope is left.
+RESTS, ROUNDING = 50, 1e-10
+NAME = "interior point"  # name of its iterations in the log
+STEPS = 12  # largest number of steps of an active set: a solve that needs more does not converge
 M = TypeVar("M")
 
 
@@ -248,17 +261,19 @@ class Stages:
     @functools.cached_property
     def active_set(self) -> tuple[records.ActiveSetArrays, StructuredArray]:
         """Arrays of an active set, and its state between calls."""
-        return zeros_of(records.ActiveSetArrays, **self._lengths), np.zeros(1, ACTIVE_SET)
+        return zeros_of(records.ActiveSetArrays, **self._lengths), np.zeros(1, records.ACTIVE_SET)
 
     @functools.cached_property
     def interior(self) -> tuple[records.InteriorArrays, StructuredArray]:
         active, memory = self.active_set
         crossover = {"active": active, "active_memory": memory}
-        return zeros_of(records.InteriorArrays, crossover, **self._lengths, LATELY=LATELY), np.zeros(1, INTERIOR)
+        return zeros_of(records.InteriorArrays, crossover, **self._lengths, LATELY=LATELY), np.zeros(
+            1, records.INTERIOR
+        )
 
     @functools.cached_property
     def restoration(self) -> tuple[records.RestorationArrays, StructuredArray]:
-        return zeros_of(records.RestorationArrays, **self._lengths), np.zeros(1, RESTORATION)
+        return zeros_of(records.RestorationArrays, **self._lengths), np.zeros(1, records.RESTORATION)
 
 
 _pool = Pool[Stages]()
@@ -270,3 +285,309 @@ def _shape(problem: Problem) -> _Shape:
     space, counts = problem.control_coordinates, tuple(term.rows for term in problem.constraint_terms)
     lower, upper = (tuple(np.flatnonzero(np.isfinite(side)).tolist()) for side in (space.low, space.high))
     return len(problem.dynamics.state_coordinates), len(space), problem.steps, counts, lower, upper
+
+
+class Measures(NamedTuple):
+    """Residuals of a plan."""
+
+    cost: float
+    stationarity: float  # largest slope of the Lagrangian in a control, times its range, relative to the cost
+    violation: float  # of the worst constraint, in its unit
+    gap: float  # the largest between two steps, relative to the states' ranges
+    complementarity: float  # the largest product of a multiplier and its margin, relative to the cost
+
+    @classmethod
+    def of(cls, memory: StructuredArray) -> "Measures":
+        """Those that compiled code left in its memory."""
+        return cls(*(float(memory[name][0]) for name in cls._fields))
+
+    def record(self, laps: Laps, method: str = NAME, seconds: float | None = None) -> None:
+        """Record the residuals as those of an iteration; by default it took all the time since the last one."""
+        optimality = max(self.stationarity, self.complementarity)
+        laps.record(method, self.cost, optimality=optimality, gap=self.gap, violation=self.violation, seconds=seconds)
+
+
+class Barrier(NamedTuple):
+    """The barrier with which an interior point begins."""
+
+    parameter: float  # of each row, as a fraction of the cost divided by the number of rows
+    slack: float  # the least, relative to a row's size, or to a control's range
+
+
+# For plans that are far from an optimum, for those with a duration that is found now, and next to an optimum.
+STRONG, MEDIUM, WEAK = Barrier(1.0, 0.06), Barrier(1.0, 0.02), Barrier(0.01, 0.01)
+
+
+@dataclass(kw_only=True, eq=False)
+class InteriorResult:
+    """Result of a run."""
+
+    plan: Motion  # feasible except for gaps
+    gain: Array  # (T, m, n) about it
+    measures: Measures
+    multipliers: tuple[Array, ...]  # of each constraint (T+1, rows)
+    pressing: Array  # (T, m), the same of the limits, positive if a control presses against its upper limit
+    solved: bool  # whether all measures are within tolerance
+    flat: bool  # whether it ended because the cost no longer changed, without being stationary
+    sizes: Sizes
+    scale: float  # the cost to which measures are relative
+
+    def trajectory(self, dt: float) -> Trajectory:
+        return Trajectory(self.plan.states, self.plan.controls, dt)
+
+
+class InteriorPoint:
+    """Runs the interior point from one plan.
+
+    Args:
+      plan: initial states (T+1, n) and controls (T, m), which need satisfy neither dynamics nor constraints.
+      price: price of violating a constraint, in cost per unit; the constraint is then elastic. Infinite if it must
+        hold. Or a price for each row, (R,); or a function of the typical sizes that returns these.
+      multipliers: known multipliers of the constraints, (T+1, rows) each, or none.
+      oldest: number of further steps for which derivatives of the dynamics may serve. Nothing is then learned of their
+        curvature.
+    """
+
+    def __init__(
+        self, stages: Stages, plan: Motion, barrier: Barrier = MEDIUM, *,
+        price: float | Array | Callable[[Sizes], Array] = np.inf, multipliers: tuple[Array, ...] = (), oldest: int = 0,
+    ) -> None:  # fmt: skip
+        self._stages, self._iterations = stages, 0
+        problem = stages.problem
+        begun = Motion(plan.states.copy(), np.clip(plan.controls, stages.low, stages.high))
+        if isinstance(problem.initial, FixedState):
+            fixed = stages.free == 0
+            begun.states[0, fixed] = np.asarray(problem.start)[fixed]
+        known = in_c_order(stages.of_constraints(multipliers)).reshape(-1)
+        self._begun = records.PlanBeginning(
+            Motion(*map(in_c_order, begun)), known, bool(multipliers), float(barrier.parameter), float(barrier.slack),
+            float(oldest),
+        )  # fmt: skip
+        self._arrays, self._memory = stages.interior
+        self._log = np.zeros(0, records.MEASURES)
+        self._tolerances = np.nan, np.nan
+        self._call(SCALE, 0)
+        self._sizes = stages.sized(float(self._memory["typical"][0]))
+        stages.state(price=price(self._sizes) if callable(price) else price)
+        self._call(BEGIN, 0)
+
+    def run(
+        self, *, tolerance: float, violation: float, most: int, near: bool = False, hurried: bool = True,
+        laps: Laps | None = None, over: Callable[[Measures, float], bool] = lambda measures, seconds: False,
+    ) -> InteriorResult:  # fmt: skip
+        """Iterate until the measures are within tolerance, no step helps, or it is `over`.
+
+        Args:
+          tolerance: of stationarity, gaps and complementarity. violation: that of the constraints, in their units.
+          near: whether the plan may be next to the answer.
+          laps: which record the iterations.
+          over: called with the measures of each iteration, and its seconds, once it is recorded; True ends the run.
+          hurried: whether it is to be called after each iteration, rather than after `ATTENTION` seconds.
+        """
+
+        def watch(measures: Measures, seconds: float) -> bool:
+            if laps is not None:
+                measures.record(laps, seconds=seconds)
+            return over(measures, seconds)
+
+        self._log = np.zeros(most, records.MEASURES)
+        if len(self._arrays.filter) < most:  # like the log, the filter gets a row at each iteration
+            self._arrays = self._arrays._replace(filter=np.zeros((most, 2)))
+            self._stages.interior = self._arrays, self._memory
+        self._tolerances = float(tolerance), float(violation)
+        self._stages.state(margin=INSIDE * violation)
+        clock = time.perf_counter()
+        if near and self._call(POLISH, 1)[1] == CONVERGED:
+            self._iterations = 1
+            watch(Measures.of(self._memory), time.perf_counter() - clock)
+            return self._result(True)
+        outcome = RUNNING
+        slices = _in_slices(
+            self._stages.problem, self._log, lambda _, last: self._call(ITERATE, last),
+            lambda row, seconds: watch(Measures(*row), seconds), hurried=hurried,
+        )  # fmt: skip
+        for self._iterations, outcome, _ in slices:
+            if outcome != RUNNING:
+                break
+        if outcome == RUNNING:
+            self._call(CLOSE, self._iterations)
+        return self._result(bool(self._memory["solved"][0]) or self._rests())
+
+    def _rests(self) -> bool:
+        """Whether only rounding of the slope is left, which unstable dynamics enlarge."""
+        tolerance, violation = self._tolerances
+        last, now = self._log[max(self._iterations - RESTS, 0) : self._iterations], Measures.of(self._memory)
+        if len(last) < RESTS or self._stages.about.learns or now.violation > violation:
+            return False
+        return np.ptp(last["cost"]) <= ROUNDING * abs(now.cost) and max(now.gap, now.complementarity) < tolerance
+
+    def _call(self, task: int, last: int) -> tuple[int, int]:
+        return self._stages.call(
+            "interior_point", task, self._iterations, last, *self._tolerances, self._begun, self._stages.about,
+            self._arrays, self._memory, self._log,
+        )  # fmt: skip
+
+    def _result(self, solved: bool) -> InteriorResult:
+        stages, pressing = self._stages, np.zeros((self._stages.steps, self._stages.m))
+        for row, (sign, i, _) in zip(np.flatnonzero(stages.owners == -1), stages.limits, strict=True):
+            pressing[:, i] -= sign * stages.force[:-1, row]
+        return InteriorResult(
+            plan=Motion(*map(np.copy, self._arrays.now.plan)), gain=stages.about.policy.gain,
+            measures=Measures.of(self._memory), multipliers=tuple(stages.by_constraint(stages.force)),
+            pressing=pressing, solved=solved, flat=bool(self._memory["unchanged"][0] >= FLAT_BEFORE_END),
+            sizes=self._sizes, scale=float(self._memory["scale"][0]),
+        )  # fmt: skip
+
+
+def _in_slices(
+    problem: Problem, log: StructuredArray, run: Callable[[int, int], tuple[int, int]],
+    watch: Callable[[tuple[Any, ...], float], bool], *, hurried: bool,
+) -> Iterator[tuple[int, int, bool]]:  # fmt: skip
+    """Run iterations as long as the log has room. After each slice, their number, the outcome, and whether it is over.
+
+    It is over once `watch` is true for one of the slice's rows in the log and its seconds. If `hurried`, a slice is one
+    iteration, else some of `ATTENTION` seconds.
+    """
+    functions, done, over, size = functions_of(problem), 0, False, 1
+    while not over and done < len(log):
+        first, clock = done, time.perf_counter()
+        done, outcome = run(first, min(first + size, len(log)))
+        seconds = (time.perf_counter() - clock) / max(done - first, 1)
+        for row in log[first:done].tolist():
+            over = watch(row, seconds) or over
+        if error := interrupt_of(functions):
+            raise error
+        if not hurried and not functions:
+            size = max(1, int(ATTENTION / max(seconds, 1e-9)))
+        yield done, outcome, over
+
+
+class Restored(NamedTuple):
+    """A trajectory, and two facts about it."""
+
+    plan: Motion
+    stationary: bool  # whether its violation is
+    near: bool  # whether it is nearly feasible
+
+
+def restore(
+    stages: Stages, plan: Motion, sizes: Sizes, *, price: float, most: int, laps: Laps, over: Callable[[], bool],
+    stationary: Callable[[Motion, list[Array]], bool], hurried: bool = True,
+) -> Restored | None:  # fmt: skip
+    """Descend from the rollout of a plan's controls (T, m); None if a trajectory is not finite, or there is no step.
+
+    Args:
+      price: of violating a constraint by its typical size, in units of the typical cost.
+      laps: which record the iterations. over: called after each; True ends it.
+      stationary: called once the predicted decrease is negligible; returns whether the violation of a trajectory is
+        stationary, which ends it. It gets each constraint's multipliers relative to the price, (T+1, rows), in -1 to 1.
+      hurried: as in `InteriorPoint.run`.
+    """
+    work, memory = stages.restoration
+    stages.resize(sizes)
+    work.plan.states[...], work.plan.controls[...] = plan
+    log, price = np.zeros(most, records.RESTORED), float(price * sizes.cost)
+
+    def run(first: int, last: int) -> tuple[int, int]:
+        return stages.call("restoration", first, last, price, stages.about, work, memory, log)
+
+    def watch(row: tuple[Any, ...], seconds: float) -> bool:
+        cost, violation, predicted, *_ = row
+        laps.record("restoration", cost, optimality=predicted, violation=violation, seconds=seconds)
+        return over()
+
+    run(0, 0)
+    outcome, at_minimum = RUNNING, False
+    for _, outcome, ended in _in_slices(stages.problem, log, run, watch, hurried=hurried):
+        if outcome == NO_PROGRESS and not ended:
+            shares = stages.by_constraint(work.relative_multipliers.reshape(stages.live.shape))
+            at_minimum = stationary(Motion(*map(np.copy, work.plan)), shares)
+        if at_minimum or outcome not in (RUNNING, NO_PROGRESS):
+            break
+    if outcome == NOT_FINITE:
+        return None
+    return Restored(Motion(*map(np.copy, work.plan)), at_minimum, bool(memory["nearly_feasible"][0]))
+
+
+class ActiveSet:
+    """Steps from one plan, not necessarily feasible, whose first state is the start.
+
+    The violation is the tolerance of equalities; a fraction of it is the margin of inequalities.
+
+    Attributes:
+      plan: the current plan, which steps overwrite. held: (T+1, R) 1 for rows held at their targets, else 0.
+      hopeless: whether the plan is stationary but violates rows that no multiplier corrects.
+      model_seconds: spent on the models of a plan.
+    """
+
+    def __init__(self, stages: Stages, plan: Motion, multipliers: tuple[Array, ...], violation: float) -> None:
+        self._stages, self._violation, self.hopeless = stages, float(violation), False
+        self._arrays, self._memory = stages.active_set
+        self.plan, self.held = self._arrays.plan, stages.held
+        self.plan.states[...], self.plan.controls[...] = plan
+        stages.state(price=np.inf, margin=INSIDE * violation)
+        stages.force[...] = stages.of_constraints(multipliers)
+        clock = time.perf_counter()
+        self._call(active_set.BEGIN)
+        self.model_seconds = time.perf_counter() - clock
+
+    @property
+    def measures(self) -> Measures:
+        return Measures.of(self._memory)
+
+    def run(self, tolerance: float, watch: Callable[[Measures], bool], late: Callable[[float], bool]) -> bool:
+        """Take steps until the measures are within tolerance; return whether they are.
+
+        After each step `watch` may end it. Called before a piece of work with its expected duration in seconds, `late`
+        may abandon the step.
+        """
+        ended = False
+        for _ in range(STEPS):
+            before = self.measures
+            if self._within(tolerance) or ended or not self._step(late):
+                break
+            ended = watch(self.measures) or not np.isfinite(self.measures.cost)
+            # If everything else is within tolerance, a remaining violation cannot be removed.
+            idle = max(before.stationarity, before.gap) < tolerance
+            self.hopeless = idle and self.measures.violation > 0.5 * before.violation > self._violation
+            ended = ended or self.hopeless
+        return self._within(tolerance)
+
+    def _within(self, tolerance: float) -> bool:
+        measures = self.measures
+        # The rollout of the plan must not use up the margin of the constraints.
+        feasible = self._memory["kept"][0] > 0
+        return feasible and max(measures.stationarity, measures.gap / INSIDE, measures.complementarity) < tolerance
+
+    def _step(self, late: Callable[[float], bool]) -> bool:
+        """Take a step; return False if there is none, or no time for it: twice that of the models is needed."""
+        before = self.held.copy()
+        self._call(active_set.PREPARE)
+        outcome = RUNNING
+        while outcome == RUNNING:
+            outcome = self._call(active_set.PIVOT)
+            if late(2 * self.model_seconds):
+                self.held[...] = before
+                return False
+        if outcome == CONVERGED:
+            self._call(active_set.TAKE)
+        return outcome == CONVERGED
+
+    def carried_out(self) -> tuple[Motion, Array, float, list[Array]]:
+        """The rollout of the plan with gains (T, m, n) about it; the gains; its cost; the constraints' values."""
+        about, steps = self._stages.about, self._stages.steps
+        self._call(active_set.ROLL_OUT)
+        values = [rows.reshape(steps + 1, -1) for rows in about.values]
+        return Motion(*map(np.copy, self._arrays.out)), about.policy.gain.copy(), self.measures.cost, values
+
+    def multipliers(self) -> tuple[Multipliers, ...]:
+        """The multipliers of each constraint, with a penalty."""
+        stages, scale, multipliers = self._stages, float(self._memory["scale"][0]), list[Multipliers]()
+        for k, force in enumerate(stages.by_constraint(stages.force)):
+            sizes = stages.row_sizes[stages.owners == k]
+            price = active_set.FIRMNESS * scale / float(np.median(sizes**2)) if len(sizes) else 1.0
+            multipliers.append(Multipliers(force, price))
+        return tuple(multipliers)
+
+    def _call(self, task: int) -> int:
+        return self._stages.call("active_set", task, self._violation, self._stages.about, self._arrays, self._memory)

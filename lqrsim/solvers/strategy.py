@@ -31,12 +31,10 @@ from lqrsim.solvers.assembly import assemble, clearance_of
 from lqrsim.solvers.budget import Budget, Stop
 from lqrsim.solvers.engine import RunResult, SolveRun, copied
 from lqrsim.solvers.finish import Known, finish, from_beside, from_states, refine
-from lqrsim.solvers.initial_guess import InitialGuess, StartLike, resolve
-from lqrsim.solvers.multistart import FOLLOWED, SWAYS, choose, guides, passable, sinusoidal_controls, sinusoidal_name
+from lqrsim.solvers.multistart import SWAYS, choose, guides, passable, sinusoidal_controls, sinusoidal_name
 from lqrsim.solvers.risk import name_risk
-from lqrsim.solvers.settings import SmootherSettings
+from lqrsim.solvers.settings import InitialGuess, SmootherSettings, StartLike, resolve
 from lqrsim.solvers.tree import ways_by_trees
-from lqrsim.solvers.ways import ways
 
 # Controls are idle if they are this close to the nominal controls, relative to their size, which counts as at least 1.
 IDLE = 1e-6
@@ -256,7 +254,7 @@ class Search:
     def _follow_ways(self) -> None:
         """Begin with ways of states, whatever a rollout does; all of them, because it is not known which is best."""
         problem = self._problem
-        for way in list(ways(problem, self.best[0].stages)):
+        for way in list(multistart.ways(problem, self.best[0].stages)):
             if self._stop.due:
                 return
             self._known.from_start = False
@@ -873,7 +871,7 @@ def approaches(problem: Problem, result: RunResult, places: list[int]) -> Iterat
         drawn = ~np.isnan(about)
         ways = np.where(drawn, about, -np.inf).max(axis=0) - np.where(drawn, about, np.inf).min(axis=0)
         ways = np.maximum(ways, LEAST_WAY * ways.max())
-        weights = np.where(drawn[0], FOLLOWED * abs(result.cost) / (problem.steps * ways**2), 0.0)
+        weights = np.where(drawn[0], multistart.FOLLOWED * abs(result.cost) / (problem.steps * ways**2), 0.0)
         stage = problem.stage_cost + QuadraticCost(
             drawn[:, :, None] * np.diag(weights), about=np.where(drawn, about, 0.0)
         )

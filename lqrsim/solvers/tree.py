@@ -27,9 +27,8 @@ from lqrsim.problem.quadratic_cost import ControlCost, QuadraticCost
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.solvers.budget import Budget, Stop
 from lqrsim.solvers.engine import SolveRun
-from lqrsim.solvers.initial_guess import InitialGuess, resampled
 from lqrsim.solvers.multistart import passable
-from lqrsim.solvers.settings import SmootherSettings
+from lqrsim.solvers.settings import InitialGuess, SmootherSettings, resampled
 from lqrsim.solvers.stages import Stages
 
 EXTENSIONS = 4000  # of a pair of trees: some 3 s in a bugtrap, so that a time limit has room for several pairs

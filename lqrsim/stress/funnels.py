@@ -32,7 +32,7 @@ from lqrsim.simulation.closed_loop import simulate_from
 from lqrsim.simulation.disturbances import Disturbance, InitialStateError, as_disturbances
 from lqrsim.simulation.effects import seeded
 from lqrsim.simulation.plant import Plant
-from lqrsim.solvers.parallel import check_threads
+from lqrsim.solvers.budget import check_threads
 from lqrsim.stress.statistics import CONFIDENCE, Estimate
 from lqrsim.stress.statistics import rate as rate_of
 from lqrsim.versions import versions
