@@ -19,7 +19,8 @@ from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajecto
 from lqrsim.rotations import AXES, quaternion, rotation_vector
 from lqrsim.solvers import compiled
 from lqrsim.solvers.certify import LAW, MOTION
-from lqrsim.solvers.engine import RunResult
+from lqrsim.solvers.engine import RunResult, SolveRun
+from lqrsim.solvers.risk import name_risk
 from lqrsim.solvers.settings import can_be_exact
 from lqrsim.versions import versions
 
@@ -42,11 +43,14 @@ ROUNDING = 1e-6  # of an eigenvalue by MuJoCo's differences, relative to its siz
 
 
 def assemble(
-    problem: Problem, result: RunResult, log: Sequence[Iteration], *, solver: str, options: dict[str, object],
+    run: SolveRun, result: RunResult, *, solver: str, options: dict[str, object],
     candidates: tuple[Candidate, ...] = (),
 ) -> Solution:  # fmt: skip
     """Copy the result of a run into a Solution."""
+    problem, log = run.problem, run.budget.log
     assert result.certificate is not None
+    if result.status is Status.RISK_TOO_HIGH:
+        result = replace(result, detail=name_risk(run, result))
     falls = bool(log) and result.cost < -UNBOUNDED * max(1.0, abs(log[0].cost))
     if falls and not result.success and result.status is not Status.NOT_POSITIVE_DEFINITE:
         result = replace(result, status=Status.DIVERGED, detail="the cost falls without bound")

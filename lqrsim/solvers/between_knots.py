@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from math import inf
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 
@@ -186,12 +186,19 @@ def solve_between_knots(
     """
     at_knots, tolerance = replace(problem, accuracy=None, between_knots=False), settings.violation_tolerance(problem)
     accuracy = problem.accuracy or np.inf
-    rows = [Rows(np.zeros((problem.steps, term.rows)), np.zeros(term.rows)) for term in problem.constraint_terms]
+    rows = [
+        WithinPeriods(constraint, np.zeros((problem.steps, term.rows)), np.zeros(term.rows))
+        for constraint, term in zip(problem.constraints, problem.constraint_terms, strict=True)
+    ]
+
+    def stated(dt: float) -> Problem:
+        """The problem with rows within its periods beside the constraints that are asked."""
+        within = [added for added in rows if added.acts.any()]
+        return replace(at_knots, dt=dt).with_constraints([*problem.constraints, *within])
 
     def again(last: Solution) -> Solution:
-        stated = _with_rows_within(problem, replace(at_knots, dt=last.trajectory.dt), rows)
         begun = {} if problem.duration is None else {"begin": last}
-        return solve(stated, replace(settings, start=last, starts=None), **begun)
+        return solve(stated(last.trajectory.dt), replace(settings, start=last, starts=None), **begun)
 
     solution, rounds, failed = solve(at_knots, settings), 0, 0
     iterations, ended = solution.iterations, {}
@@ -202,7 +209,7 @@ def solve_between_knots(
                 solution = again(solution)
             else:  # another way than the last plan's
                 rows = [added.everywhere() for added in rows]
-                solution = solve(_with_rows_within(problem, replace(at_knots, dt=problem.dt), rows), settings)
+                solution = solve(stated(problem.dt), settings)
             rounds, iterations = rounds + 1, (*iterations, *solution.iterations)
             continue
         at_knots = replace(at_knots, dt=solution.trajectory.dt)
@@ -240,37 +247,6 @@ def solve_between_knots(
     )  # fmt: skip
 
 
-def _with_rows_within(problem: Problem, at_knots: Problem, rows: "list[Rows]") -> Problem:
-    """The problem with rows within its periods beside the constraints that are asked."""
-    pairs = zip(problem.constraints, rows, strict=True)
-    within = [WithinPeriods(constraint, *added) for constraint, added in pairs if added.acts.any()]
-    return at_knots.with_constraints([*problem.constraints, *within])
-
-
-class Rows(NamedTuple):
-    """The rows of a constraint within periods: `acts` and `spares` of `WithinPeriods`."""
-
-    acts: Array
-    spares: Array
-
-    def everywhere(self) -> "Rows":
-        """With the rows that act in some period acting in all."""
-        return self._replace(acts=np.where(self.acts.any(axis=0), 1.0, self.acts))
-
-    def against(self, worst: Array, tolerance: float) -> "Rows":
-        """With rows in the periods where violations (T, rows) are, and beside them, since a plan may turn up there.
-
-        Where such rows act already, they spare what is violated between them.
-        """
-        missed = worst > tolerance
-        near = missed.copy()
-        near[1:] |= missed[:-1]
-        near[:-1] |= missed[1:]
-        again = np.where(missed & (self.acts > 0), worst, 0.0).max(axis=0)
-        more = np.where(again > 0, SPARED * again, 0.0)
-        return Rows(np.maximum(self.acts, near), np.maximum(self.spares, 0.5 * tolerance) + more)
-
-
 class WithinPeriods(Constraint):
     """An inequality at `TIMES` times within some control periods; for dynamics that are a formula.
 
@@ -283,6 +259,23 @@ class WithinPeriods(Constraint):
 
     def __init__(self, constraint: Constraint, acts: Array, spares: Array) -> None:
         self.constraint, self.acts, self.spares = constraint, acts, spares
+
+    def everywhere(self) -> Self:
+        """With the rows that act in some period acting in all."""
+        return self._at_other_knots(lambda acts: np.where(acts.any(axis=0), 1.0, acts))
+
+    def against(self, worst: Array, tolerance: float) -> Self:
+        """With rows in the periods where violations (T, rows) are, and beside them, since a plan may turn up there.
+
+        Where such rows act already, they spare what is violated between them.
+        """
+        missed = worst > tolerance
+        near = missed.copy()
+        near[1:] |= missed[:-1]
+        near[:-1] |= missed[1:]
+        again = np.where(missed & (self.acts > 0), worst, 0.0).max(axis=0)
+        more = np.where(again > 0, SPARED * again, 0.0)
+        return type(self)(self.constraint, np.maximum(self.acts, near), np.maximum(self.spares, 0.5 * tolerance) + more)
 
     @property
     def by_knot(self) -> bool:

@@ -122,7 +122,7 @@ class PreparedSolver(OneVersion):
             run.work.constraint_slope(which, 0, state, guess.offset[0], 0)
         if self.problem.constraints and run.second_order:
             stages, plan, best = run.stages, Motion(*run.work.best), _Best(run)
-            _finder(run, plan, best).find()
+            _Finder(run, plan, best).find()
             if _can_yield(self.problem):
                 return
             # Another solve may need code that this solve did not need.
@@ -190,7 +190,7 @@ class PreparedSolver(OneVersion):
         best = _Best(run)
         with problem.dynamics.solving(self.threads):
             if problem.constraints and run.second_order:
-                finder = _finder(run, _plan_of(start, best), best, self._closing)
+                finder = _Finder(run, _plan_of(start, best), best, self._closing)
                 result, ended = finder.find(), finder.laps.ended
                 if finder.may_be_far:
                     best.consider(result)
@@ -299,7 +299,8 @@ class _Finder:
 
     def find(self) -> RunResult:
         """Run until it converges or has to stop."""
-        raise NotImplementedError
+        with np.errstate(all="ignore"):
+            return self._giving_way() if _can_yield(self._run.problem) else self._beside()
 
     def _late(self, seconds: float) -> bool:
         """Whether work of this duration would end too late; if so, the solve ends."""
@@ -310,11 +311,8 @@ class _Finder:
     def _unsolved(self) -> Status:
         return Status.TIME_LIMIT if self._out_of_time else Status.MAX_ITERATIONS
 
-
-class _Neighbour(_Finder):
-    """Newton steps with the active set of the plan, or the interior point."""
-
-    def find(self) -> RunResult:
+    def _beside(self) -> RunResult:
+        """Newton steps with the active set of the plan, or the interior point."""
         run, budget = self._run, self._budget
         if self._late(0.0):
             return self._best.result
@@ -322,25 +320,34 @@ class _Neighbour(_Finder):
             detail = "the policy that it begins with diverges"
             return replace(self._best.result, status=Status.NOT_FINITE, detail=detail)
         known = tuple(multipliers.values for multipliers in run.initial_guess.multipliers)
-        with np.errstate(all="ignore"):
-            active = ActiveSet(self._stages, self._plan, known, self._run.allowed)
-            self.laps.ended = time.perf_counter()
-            solved = self._solve(active)
-            if not (solved or active.hopeless or self._late(BEGINNING * active.model_seconds)) and budget.left:
-                point = InteriorPoint(self._stages, copied(self._best.result), WEAK, multipliers=known)
-                result = point.run(
-                    tolerance=run.final, violation=run.allowed, most=budget.left, laps=self.laps,
-                    over=lambda _, seconds: self._late(seconds) or not budget.left,
-                )  # fmt: skip
-                if result.solved or not np.isfinite(active.measures.cost):
-                    active = ActiveSet(self._stages, result.plan, result.multipliers, self._run.allowed)
-                    solved = self._solve(active)
-            self.laps.ended = time.perf_counter()
-            in_time = self.laps.ended + ELSEWHERE * active.model_seconds + self._closing < budget.stop.deadline
-            self.may_be_far = not solved and in_time and budget.left > 1
-            return self._result(active, solved)
+        active = ActiveSet(self._stages, self._plan, known, run.allowed)
+        self.laps.ended = time.perf_counter()
+        solved = self._take_steps(active)
+        if not (solved or active.hopeless or self._late(BEGINNING * active.model_seconds)) and budget.left:
+            point = InteriorPoint(self._stages, copied(self._best.result), WEAK, multipliers=known)
+            result = point.run(
+                tolerance=run.final, violation=run.allowed, most=budget.left, laps=self.laps,
+                over=lambda _, seconds: self._late(seconds) or not budget.left,
+            )  # fmt: skip
+            if result.solved or not np.isfinite(active.measures.cost):
+                active = ActiveSet(self._stages, result.plan, result.multipliers, run.allowed)
+                solved = self._take_steps(active)
+        self.laps.ended = time.perf_counter()
+        in_time = self.laps.ended + ELSEWHERE * active.model_seconds + self._closing < budget.stop.deadline
+        self.may_be_far = not solved and in_time and budget.left > 1
+        if not np.isfinite(active.measures).all():
+            return replace(self._best.result, status=self._unsolved, detail=raised_by(functions_of(run.problem)))
+        plan, gain, cost, values = active.carried_out()
+        for term, numbers in zip(run.problem.constraint_terms, values, strict=True):
+            solved = solved and violation_of(term, numbers) <= allowed_violation(term, run.allowed)
+        detail = "no plan near it keeps the constraints" if active.hopeless and not solved else ""
+        return RunResult(
+            status=Status.CONVERGED if solved else self._unsolved, detail=detail, plan=plan,
+            law=compiled.law_about(*plan, gain), cost=cost, violation=run.work.violation(values),
+            multipliers=active.multipliers(),
+        )  # fmt: skip
 
-    def _solve(self, active: ActiveSet) -> bool:
+    def _take_steps(self, active: ActiveSet) -> bool:
         """Take the steps of an active set; return whether they converge. A step that would be too late is abandoned."""
 
         def watch(measures: Measures) -> bool:
@@ -349,63 +356,57 @@ class _Neighbour(_Finder):
 
         return active.run(self._run.final, watch, self._late)
 
-    def _result(self, active: ActiveSet, solved: bool) -> RunResult:
-        """The rollout of the plan with a policy about it."""
-        problem = self._run.problem
-        if not np.isfinite(active.measures).all():
-            return replace(self._best.result, status=self._unsolved, detail=raised_by(functions_of(problem)))
-        plan, gain, cost, values = active.carried_out()
-        for term, numbers in zip(problem.constraint_terms, values, strict=True):
-            solved = solved and violation_of(term, numbers) <= allowed_violation(term, self._run.allowed)
-        detail = "no plan near it keeps the constraints" if active.hopeless and not solved else ""
-        return RunResult(
-            status=Status.CONVERGED if solved else self._unsolved, detail=detail, plan=plan,
-            law=compiled.law_about(*plan, gain), cost=cost, violation=self._run.work.violation(values),
-            multipliers=active.multipliers(),
+    def _giving_way(self) -> RunResult:
+        """The plan if constraints give way that the robot keeps by itself: limits of forces, which MuJoCo clips. It is
+        carried out with feedback, unless it is worse than the best.
+
+        After a push, no plan may keep them. A stiff servo whose target is held for a period cannot keep its force
+        within its limits from any velocity: at 450 N m s/rad and 87 N m, 0.2 rad/s are too much. The robot then clips
+        the force, and the deviation ends within some physics steps. So a violation has a price, and the next plans
+        bring the forces back.
+
+        The plan hardly moves from one solve to the next, and derivatives by MuJoCo take most of the time of an
+        iteration. So those about the first plan serve for all steps that need not be shortened, and are computed anew
+        at the end.
+        """
+        run, stages, budget, clock = self._run, self._stages, self._budget, time.perf_counter()
+        terms, prices = run.problem.constraint_terms, np.zeros(0)
+        yields = (stages.owners >= 0) & np.array([term.yields for term in terms])[stages.owners]
+
+        def price(sizes: Sizes) -> Array:
+            nonlocal prices
+            prices = np.where(yields, PRICE * sizes.cost / sizes.rows, np.inf)
+            return prices
+
+        def rank(plan: Motion, cost: float) -> tuple[bool, float, float]:
+            """Sort key, best first: violation of what does not give way, then the cost with prices of violations."""
+            values, missed = stages.values(plan), 0.0
+            for term, numbers in zip(terms, run.work.constraint_values(plan), strict=True):
+                if not term.yields:
+                    missed = max(missed, violation_of(term, numbers) - allowed_violation(term, run.allowed))
+            short = np.where(stages.live & yields, np.maximum(-values, 0.0), 0.0)
+            paid = float((short * np.where(yields, prices, 0.0)).sum())
+            return not np.isfinite(plan.states).all(), missed, cost + paid
+
+        point = InteriorPoint(stages, self._plan, STRONGER, price=price, oldest=OLDEST)
+        self.laps.ended = time.perf_counter()
+        model_seconds = self.laps.ended - clock
+        if self._late(model_seconds) or not budget.left:
+            return replace(self._best.result, status=self._unsolved)
+        result = point.run(
+            tolerance=run.final, violation=run.allowed, most=budget.left, laps=self.laps,
+            over=lambda _, seconds: self._late(model_seconds + seconds),  # the next may compute derivatives anew
         )  # fmt: skip
-
-
-def _can_yield(problem: Problem) -> bool:
-    return any(term.yields for term in problem.constraint_terms)
-
-
-class _Yielding(_Finder):
-    """A solve in which constraints give way that the robot keeps by itself: limits of forces, which MuJoCo clips.
-
-    After a push, no plan may keep them. A stiff servo whose target is held for a period cannot keep its force within
-    its limits from any velocity: at 450 N m s/rad and 87 N m, 0.2 rad/s are too much. The robot then clips the force,
-    and the deviation ends within some physics steps. So a violation has a price, and the next plans bring the forces
-    back.
-
-    The plan hardly moves from one solve to the next, and derivatives by MuJoCo take most of the time of an iteration.
-    So those about the first plan serve for all steps that need not be shortened, and are computed anew at the end.
-    """
-
-    def find(self) -> RunResult:
-        """The plan that is found, carried out with feedback, unless it is worse than the best."""
-        run, budget, clock = self._run, self._budget, time.perf_counter()
-        terms, owners = run.problem.constraint_terms, run.stages.owners
-        self._yields = (owners >= 0) & np.array([term.yields for term in terms])[owners]
-        with np.errstate(all="ignore"):
-            point = InteriorPoint(run.stages, self._plan, STRONGER, price=self._price, oldest=OLDEST)
-            self.laps.ended = time.perf_counter()
-            model_seconds = self.laps.ended - clock
-            if self._late(model_seconds) or not budget.left:
-                return replace(self._best.result, status=self._unsolved)
-            result = point.run(
-                tolerance=run.final, violation=run.allowed, most=budget.left, laps=self.laps,
-                over=lambda _, seconds: self._late(model_seconds + seconds),  # the next may compute derivatives anew
-            )  # fmt: skip
-            law = compiled.law_about(*result.plan, result.gain.copy())
-            plan = run.work.roll_out(law, self._plan.states[0])
-            reached = run.stages.trial(plan)[0]
-            rank = self._rank(plan, reached)
-            solved = result.solved and rank[1] == 0
-            if not solved and rank > self._rank(self._best.result.plan, self._best.result.cost):
-                return replace(self._best.result, status=self._unsolved)
-        work, status = run.work, Status.CONVERGED if solved else self._unsolved
-        violation, detail = work.violation(work.constraint_values(plan)), ""
-        if violation > self._run.allowed:
+        law = compiled.law_about(*result.plan, result.gain.copy())
+        plan = run.work.roll_out(law, self._plan.states[0])
+        reached = stages.trial(plan)[0]
+        found = rank(plan, reached)
+        solved = result.solved and found[1] == 0
+        if not solved and found > rank(self._best.result.plan, self._best.result.cost):
+            return replace(self._best.result, status=self._unsolved)
+        status = Status.CONVERGED if solved else self._unsolved
+        violation, detail = run.work.violation(run.work.constraint_values(plan)), ""
+        if violation > run.allowed:
             lagrangian = AugmentedLagrangian(run)
             lagrangian.evaluate(plan)
             detail = f"elastic: {lagrangian.worst()}"
@@ -413,24 +414,9 @@ class _Yielding(_Finder):
         self._best.adopt(answer)
         return answer
 
-    def _price(self, sizes: Sizes) -> Array:
-        self._prices = np.where(self._yields, PRICE * sizes.cost / sizes.rows, np.inf)
-        return self._prices
 
-    def _rank(self, plan: Motion, cost: float) -> tuple[bool, float, float]:
-        """Sort key, best first: violation of what does not give way, then the cost with the prices of violations."""
-        values, stages, missed = self._run.stages.values(plan), self._run.stages, 0.0
-        pairs = zip(self._run.problem.constraint_terms, self._run.work.constraint_values(plan), strict=True)
-        for term, numbers in pairs:
-            if not term.yields:
-                missed = max(missed, violation_of(term, numbers) - allowed_violation(term, self._run.allowed))
-        short = np.where(stages.live & self._yields, np.maximum(-values, 0.0), 0.0)
-        paid = float((short * np.where(self._yields, self._prices, 0.0)).sum())
-        return not np.isfinite(plan.states).all(), missed, cost + paid
-
-
-def _finder(run: SolveRun, plan: Motion, best: "_Best", closing: float = 0.0) -> _Finder:
-    return (_Yielding if _can_yield(run.problem) else _Neighbour)(run, plan, best, closing)
+def _can_yield(problem: Problem) -> bool:
+    return any(term.yields for term in problem.constraint_terms)
 
 
 class _Best:

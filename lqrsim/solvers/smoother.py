@@ -34,7 +34,6 @@ from lqrsim.solvers.control_rates import solve_with_rates
 from lqrsim.solvers.engine import RunResult, SolveRun, copied
 from lqrsim.solvers.free_duration import solve_for_duration
 from lqrsim.solvers.multistart import STARTS, check_starts
-from lqrsim.solvers.risk import name_risk
 from lqrsim.solvers.settings import InitialGuess, InitialPrior, Settings, SmootherSettings, StartLike, resolve
 from lqrsim.solvers.strategy import Search
 
@@ -330,9 +329,7 @@ def _solve_ilqr(problem: Problem, settings: Settings, stop: Stop | None = None) 
         values={"cost_to_go": Quadratic(*work.arrays.to_go)} if complete else {},
     )  # fmt: skip
     result = run.certified(result)
-    if result.status is Status.RISK_TOO_HIGH:
-        result = replace(result, detail=name_risk(run, result))
-    solution = assemble(problem, result, log, solver="ilqr", options=settings.options(guess))
+    solution = assemble(run, result, solver="ilqr", options=settings.options(guess))
     run.give_back()
     return stop.finish(solution)
 

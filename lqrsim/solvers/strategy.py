@@ -32,7 +32,6 @@ from lqrsim.solvers.budget import Budget, Stop
 from lqrsim.solvers.engine import RunResult, SolveRun, copied
 from lqrsim.solvers.finish import Known, finish, from_beside, from_states, refine
 from lqrsim.solvers.multistart import SWAYS, choose, guides, passable, sinusoidal_controls, sinusoidal_name
-from lqrsim.solvers.risk import name_risk
 from lqrsim.solvers.settings import InitialGuess, SmootherSettings, StartLike, resolve
 from lqrsim.solvers.tree import ways_by_trees
 
@@ -616,15 +615,13 @@ class Search:
             result = replace(result, status=Status.TIME_LIMIT, detail=f"{result.detail}; {untried}".removeprefix("; "))
         elif not stop.due or (self._still is not None and not self._comes_nearer(result)):
             result = self._with_unmoved_states(result)
-        detail = name_risk(chosen, result) if result.status is Status.RISK_TOO_HIGH else result.detail
         if result.success and (cheapest := self._cheaper_elsewhere(CHEAPER)) is not None:
-            detail = "; ".join(filter(None, (detail, self._unfinished(*self._finished[cheapest]))))
+            other = self._unfinished(*self._finished[cheapest])
+            result = replace(result, detail="; ".join(filter(None, (result.detail, other))))
         tolerances = {"tolerance": chosen.final, "constraint_tolerance": self._allowed}
         begun = self._named[0][1] if settings.start is not None else chosen
-        return assemble(
-            problem, replace(result, detail=detail), chosen.budget.log, solver="smooth",
-            options=settings.options(begun.initial_guess) | tolerances, candidates=self._candidates(),
-        )  # fmt: skip
+        options = settings.options(begun.initial_guess) | tolerances
+        return assemble(chosen, result, solver="smooth", options=options, candidates=self._candidates())
 
     def _unfinished(self, run: SolveRun, result: RunResult) -> str:
         """That another plan costs less and has not converged, and how to go on from it; empty for an unnamed one."""
