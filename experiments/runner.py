@@ -19,10 +19,9 @@ from tqdm import tqdm
 
 import lqrsim as ls
 from lqrsim.commands.console import text_of
-from lqrsim.machine import description
+from lqrsim.machine import description, versions
 from lqrsim.results.archive import replacing
 from lqrsim.stress.statistics import Estimate
-from lqrsim.versions import versions
 
 Result = dict[str, Any]
 Item = TypeVar("Item")

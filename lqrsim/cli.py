@@ -95,7 +95,7 @@ def _run(arguments: list[str]) -> int:
     with process.printing(), process.environment(**{"COLUMNS": str(NARROWEST)} if too_narrow else {}):
         command = _parse(arguments)
 
-    from lqrsim.versions import outdated
+    from lqrsim.machine import outdated
 
     if line := _too_little_memory() or outdated():  # before imports that fail in little memory or with old packages
         process.print_error(f"lqrsim: error: {line}")

@@ -23,8 +23,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.machine import memory
-from lqrsim.versions import outdated
+from lqrsim.machine import memory, outdated
 
 if outdated():
     raise ImportError(f"lqrsim: {outdated()}")

@@ -440,7 +440,7 @@ class Reading(ls.belief.BeliefFeedback):
 
 
 def test_a_run_reads_its_true_states_as_late_as_is_stated() -> None:
-    """The formulas of the beacons in NumPy, to rounding; nothing before the first reading arrives, but what is known."""
+    """The formulas of the beacons in NumPy, to rounding; before the first reading arrives nothing but what is known."""
     scenario, trials = ls.scenarios.differential_drive(), 3
     problem = drive(scenario, compass=True)
     law, delay = Reading(problem, ls.smooth(problem)), 1

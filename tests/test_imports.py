@@ -15,7 +15,7 @@ PACKAGE = Path(lqrsim.__file__).parent
 
 # From the ground up: a floor imports only from floors below it; see `FLOORS_WITHIN` for the rooms that have several.
 FLOORS = (
-    ("errors", "machine", "process", "versions"),
+    ("errors", "machine", "process"),
     ("annotations",),
     ("kernels",),
     ("rotations", "outlines"),

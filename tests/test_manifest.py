@@ -15,7 +15,7 @@ import pytest
 from llvmlite.binding import FeatureMap
 
 import lqrsim as ls
-from lqrsim import machine, versions
+from lqrsim import machine
 from lqrsim.cli import main
 from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.results import Results
@@ -269,14 +269,14 @@ def test_what_is_changed_in_the_versions_of_one_result_is_not_in_others() -> Non
     before = dict(other.versions)
     changed: Any = one.versions
     changed["numpy"] = "0.1"
-    assert before == other.versions == versions.versions()
+    assert before == other.versions == machine.versions()
 
 
 def test_a_campaign_does_not_go_on_with_another_processor(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    here = versions.versions()
-    monkeypatch.setattr(versions, "versions", lambda: here | {"processor": "other 01234567"})
+    here = machine.versions()
+    monkeypatch.setattr(machine, "versions", lambda: here | {"processor": "other 01234567"})
     with pytest.raises(
         ls.InputError,
         match=f"processor other 01234567 \\(was {here['processor']}\\), which may change the last bits, want",

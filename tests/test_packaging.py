@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import try_release
 
-from lqrsim import versions
+from lqrsim import machine
 from lqrsim.cli import main
 
 ROOT = Path(__file__).parent.parent
@@ -107,20 +107,20 @@ def test_a_package_that_is_too_old_is_named(
 ) -> None:
     """As where another package has brought it: by every command, and at import; a newer one is not."""
     needs = dict(re.findall(r'"([\w.-]+)>=([\d.]+)"', (ROOT / "pyproject.toml").read_text(encoding="utf-8")))
-    found = versions.versions_of(*needs)
+    found = machine.versions_of(*needs)
     least = [int(part) for part in needs[name].split(".")]
     older = [f"{least[0] - 1}.99.4", ".".join(map(str, [*least[:-1], least[-1] - 1])), "0.0.dev3"]
     newer = [needs[name], f"{needs[name]}.0rc1", f"{least[0]}.{least[1] + 10}", f"{least[0] + 1}"]
     for version in [one for one in older if "-1" not in one] + newer:
         monkeypatch.setattr(
-            versions, "versions_of", lambda *names, one=version: {n: one if n == name else found[n] for n in names}
+            machine, "versions_of", lambda *names, one=version: {n: one if n == name else found[n] for n in names}
         )
-        versions.outdated.cache_clear()
+        machine.outdated.cache_clear()
         line = f"got {name} {version}, want newer: pip install '{name}>={needs[name]}'"
-        assert versions.outdated() == ("" if version in newer else line)
+        assert machine.outdated() == ("" if version in newer else line)
         assert main(["list"]) == (0 if version in newer else 2)
         assert capsys.readouterr().err == ("" if version in newer else f"lqrsim: error: {line}\n")
-    versions.outdated.cache_clear()
+    machine.outdated.cache_clear()
 
 
 def test_citation_is_of_this_version_and_has_the_fields_of_its_format() -> None:

@@ -18,8 +18,8 @@ import numpy as np
 import lqrsim as ls
 from lqrsim.codegen import disk_cache as disk
 from lqrsim.errors import Array
+from lqrsim.machine import versions_of
 from lqrsim.problem.costs import terms_of
-from lqrsim.versions import versions_of
 
 # Rounding as in lqrsim's compiled functions: sums may be reordered, NaN and infinity stay meaningful.
 FLAGS = (

@@ -115,8 +115,8 @@ class Replay:
     json: Json = False
 
     def run(self) -> int:
+        from lqrsim.machine import changed
         from lqrsim.stress.results import differences
-        from lqrsim.versions import changed
 
         console.check_output("--out", self.out, "file")
         results = ls.stress.Results(self.folder, scenario=self.scenario)

@@ -6,7 +6,7 @@ Each pickle names `_empty` by the address of this module, which therefore stays.
 from typing import Any, Self
 
 from lqrsim.errors import InputError
-from lqrsim.versions import versions
+from lqrsim.machine import versions
 
 
 class OneVersion:

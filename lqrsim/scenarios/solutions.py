@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lqrsim.errors import InputError, check_kind
+from lqrsim.machine import other_lqrsim
 from lqrsim.problem.problem import Problem
 from lqrsim.results.archive import sha256
 from lqrsim.results.certified import FailureCertificate
@@ -20,7 +21,6 @@ from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.solvers.settings import InitialPrior, is_function, resolve
 from lqrsim.solvers.smoother import ilqr, smooth
-from lqrsim.versions import other_lqrsim
 
 SOLVERS: Mapping[str, Callable[..., Solution]] = {"smooth": smooth, "ilqr": ilqr}
 

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from lqrsim.annotations import LINE, Count, Index, Progress, Seed, Want, check_string, checked
 from lqrsim.control.controllers import Controller, ControllerLike, ControllerRun, as_controller, turn_to_nearest
 from lqrsim.errors import Array, InputError, check_array, check_items, check_kind, check_memory, format_error, shaped
+from lqrsim.machine import versions
 from lqrsim.problem.belief import Belief
 from lqrsim.problem.noise import Noise
 from lqrsim.results.coordinates import Coordinates, check_same_system, spaces_of
@@ -30,7 +31,6 @@ from lqrsim.simulation.effects import BeliefReadings, Effects, MakeGenerator, Re
 from lqrsim.simulation.physics import AnyPhysics, MujocoPhysics, SimulatorPhysics, steps_per_frame
 from lqrsim.simulation.plant import Plant
 from lqrsim.solvers.budget import check_threads
-from lqrsim.versions import versions
 
 MOST_STEPS = 100_000_000  # physics steps in a run; they take minutes to hours
 Watch = Annotated[

@@ -10,11 +10,11 @@ import numpy as np
 
 from lqrsim.annotations import OneOf, Positive, checked
 from lqrsim.errors import Array, InputError, check_kind
+from lqrsim.machine import versions_of
 from lqrsim.robots.base import Robot
 from lqrsim.robots.packaged import Quadrotor
 from lqrsim.simulation.simulator import PARAMETERS, Simulator
 from lqrsim.simulators.quadrotors import Frame, package
-from lqrsim.versions import versions_of
 
 DRONES = ("cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350")
 INTEGRATORS = ("euler", "rk4", "symplectic_euler")

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from lqrsim.errors import Array, InputError
-from lqrsim.versions import outdated
+from lqrsim.machine import outdated
 
 TWIST = 1e-6  # m, the largest distance of rotors from the corners of a square
 

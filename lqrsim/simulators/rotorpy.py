@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from lqrsim.annotations import Positive, checked
 from lqrsim.errors import Array, InputError, check_array, check_kind, check_number, excerpt, keep
+from lqrsim.machine import versions_of
 from lqrsim.robots.base import Robot
 from lqrsim.robots.packaged import Quadrotor
 from lqrsim.simulation.simulator import PARAMETERS, Simulator
 from lqrsim.simulators.quadrotors import Frame, package
-from lqrsim.versions import versions_of
 
 GRAVITY = 9.81  # m/s2, RotorPy's
 POSITIVE = ("mass", "Ixx", "Iyy", "Izz", "k_eta", "k_m", "rotor_speed_max")  # numbers of a vehicle

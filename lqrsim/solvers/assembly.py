@@ -11,6 +11,7 @@ import numpy as np
 from lqrsim.annotations import LINE
 from lqrsim.errors import Array, printable
 from lqrsim.kernels.records import Policy
+from lqrsim.machine import versions
 from lqrsim.problem.obstacles import each_once
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import Target, departure
@@ -22,7 +23,6 @@ from lqrsim.solvers.certify import LAW, MOTION
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.risk import name_risk
 from lqrsim.solvers.settings import can_be_exact
-from lqrsim.versions import versions
 
 # The policies of plans through contacts are run from this many starts that differ by this much in each state.
 NEIGHBOURS, OFFSET = 8, 1e-9

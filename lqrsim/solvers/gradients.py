@@ -21,13 +21,13 @@ from lqrsim.annotations import Bounds, Line, Want, checked
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array, InputError, check_array, check_kind
 from lqrsim.kernels.records import Motion
+from lqrsim.machine import other_lqrsim
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Curvature, Status
 from lqrsim.solvers.budget import check_threads
 from lqrsim.solvers.certify import AT_ZERO, HELD
 from lqrsim.solvers.stages import Stages
-from lqrsim.versions import other_lqrsim
 
 # Step of the differences, relative to a parameter's scale. The error of a central difference is about its square, that
 # of rounding is 1e-16 of the cost divided by it: both are below 1e-8 where the cost changes in proportion.

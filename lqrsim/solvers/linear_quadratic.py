@@ -12,6 +12,7 @@ from scipy.linalg import matrix_balance
 from lqrsim.annotations import OneOf, Positive, checked
 from lqrsim.errors import Array, InputError, check_array, check_memory, check_symmetric, excerpt, keep
 from lqrsim.kernels.records import LinearStep, QuadraticStage, RiccatiArrays, zeros_of
+from lqrsim.machine import versions
 from lqrsim.problem.problem import FixedState
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
@@ -19,7 +20,6 @@ from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Certificate, Iteration, Moments, Quadratic, Status, Trajectory
 from lqrsim.solvers import compiled
-from lqrsim.versions import versions
 
 ACCURACY = 1e-6  # relative accuracy of cost and states that a solved problem must have
 ROUNDING = 1e-14  # of a cost in which larger terms cancel, the part of these terms that is taken for rounding

@@ -22,7 +22,7 @@ import numpy as np
 
 from lqrsim.annotations import Bounds, Progress, Want, checked
 from lqrsim.errors import InputError, check_path, excerpt, free_name, without_addresses
-from lqrsim.machine import description, processors
+from lqrsim.machine import changed, description, other_lqrsim, processors, versions
 from lqrsim.results import save_load
 from lqrsim.results.archive import sha256
 from lqrsim.results.solution_parts import Trajectory
@@ -41,7 +41,6 @@ from lqrsim.stress.results import (
     write_manifest,
 )
 from lqrsim.stress.study import Campaign, Shard, Trials
-from lqrsim.versions import changed, other_lqrsim, versions
 
 _log = logging.getLogger("lqrsim")
 

@@ -30,6 +30,7 @@ import numpy as np
 
 from lqrsim import process
 from lqrsim.errors import InputError, format_error
+from lqrsim.machine import versions
 from lqrsim.results.solution import Solution
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.closed_loop import simulate
@@ -37,7 +38,6 @@ from lqrsim.stress.analysis import COLUMNS, outcomes
 from lqrsim.stress.policies import POLICY_KINDS, make_controller
 from lqrsim.stress.results import Columns, pack
 from lqrsim.stress.study import Campaign, Cell, Shard, Trials
-from lqrsim.versions import versions
 
 FinishedShards = Generator[tuple[Shard, bytes]]
 _POLL = 0.5  # s between two checks of the time limit

@@ -22,7 +22,7 @@ from scipy.special import ndtr
 from lqrsim.annotations import Bounds, Count, Index, OneOf, Seed, TextProgress, Want, checked
 from lqrsim.control.controllers import ControllerLike, as_controller
 from lqrsim.errors import Array, InputError, check_array, check_path, excerpt, shaped
-from lqrsim.machine import description
+from lqrsim.machine import changed, description, versions
 from lqrsim.process import keeping
 from lqrsim.results import save_load
 from lqrsim.results.archive import plain, sha256, write_text
@@ -37,7 +37,6 @@ from lqrsim.simulation.plant import Plant
 from lqrsim.stress import reliability
 from lqrsim.stress.statistics import Estimate, rounded
 from lqrsim.stress.study import Study, disturbances_as_json
-from lqrsim.versions import changed, versions
 
 Size = int | Sequence[int] | None
 LEAST_DEPTH = 1e-9  # m; the score of a collision between two knots

@@ -22,6 +22,7 @@ from lqrsim.annotations import Bounds, Chance, Index, NonNegative, Positive, See
 from lqrsim.control.controllers import ControllerLike, as_controller
 from lqrsim.control.tubes import Tube
 from lqrsim.errors import Array, InputError, check_array, check_name, check_symmetric, excerpt, keep, numbers_of
+from lqrsim.machine import versions
 from lqrsim.problem.noise import Noise
 from lqrsim.process import keeping
 from lqrsim.results.certified import Funnel, flat, inverse_of
@@ -35,7 +36,6 @@ from lqrsim.simulation.plant import Plant
 from lqrsim.solvers.budget import check_threads
 from lqrsim.stress.statistics import CONFIDENCE, Estimate
 from lqrsim.stress.statistics import rate as rate_of
-from lqrsim.versions import versions
 
 KNOTS = 5  # default number of knots
 LEVEL_RANGE = 2.0**20  # largest level, relative to the first level that is tried

@@ -29,7 +29,6 @@ import tyro
 
 import lqrsim as ls
 from lqrsim.commands.console import text_of
-from lqrsim.versions import versions
 
 
 @dataclass(frozen=True)
@@ -53,6 +52,8 @@ class Config:
 
 
 def main(config: Config) -> dict[str, Any]:
+    from lqrsim.machine import versions  # an older checkout, which imports this file too, may have it elsewhere
+
     if config.quick:
         config = replace(config, queries=2, trials=2)
     with tempfile.TemporaryDirectory() as kept:
