@@ -37,7 +37,7 @@ from .problem.sites import SiteConstraint as SiteConstraint
 from .problem.sites import SiteCost as SiteCost
 from .problem.state_bounds import GoalState as GoalState
 from .problem.state_bounds import StateBounds as StateBounds
-from .reports.page import report as report
+from .reports import report as report
 from .results.export_c import export_c as export_c
 from .results.policy import AffinePolicy as AffinePolicy
 from .results.rollout import Rollout as Rollout

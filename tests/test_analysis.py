@@ -85,7 +85,7 @@ def test_equal_outcomes_of_random_trials_are_a_sample(seed: int) -> None:
     assert not found.alike
     assert len(comparisons(dict.fromkeys(cells, drawn))) == 1
     if not won:  # broken only if that is sure
-        assert (breaks({cells[0]: drawn}, below=0.5)[0].strength is None) == (1 - edge >= 0.5)
+        assert (breaks({cells[0]: drawn}, below=0.5)[0][2] is None) == (1 - edge >= 0.5)
     fixed = replace(drawn, deterministic=True)
     assert success(cells[0], fixed).alike
     assert comparisons(dict.fromkeys(cells, fixed)) == []
@@ -125,10 +125,11 @@ def test_what_breaks_first_is_sure_to_be_below_the_rate() -> None:
         for strength, reached in zip((0.0, 1.0, 2.0), of_strength, strict=True)
     }
     found = breaks(table)
-    assert [(one.policy, one.strength) for one in found] == [("weaker", 1.0), ("weak", 2.0), ("strong", None)]
-    assert found[0].success is not None
-    assert found[0].success.high < 0.95
-    assert [one.strength for one in breaks(table, below=1.0)] == [1.0, 1.0, 2.0]
+    strengths = [(policy, point and point.cell.strength) for policy, _, point in found]
+    assert strengths == [("weaker", 1.0), ("weak", 2.0), ("strong", None)]
+    assert found[0][2] is not None
+    assert found[0][2].exact.high < 0.95
+    assert [point and point.cell.strength for *_, point in breaks(table, below=1.0)] == [1.0, 1.0, 2.0]
 
 
 def test_policies_are_compared_on_the_same_trials() -> None:

@@ -32,7 +32,7 @@ from lqrsim.disturbances import (
     Unknown,
 )
 from lqrsim.errors import Array, InputError
-from lqrsim.reports.page import report
+from lqrsim.reports import report
 from lqrsim.results.goal import OF_RANGE, OF_WAY, OUTCOMES, Target
 from lqrsim.robots.base import Robot
 from lqrsim.scenarios.references import disturbance_set

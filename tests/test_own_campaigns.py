@@ -50,7 +50,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_printed_commands_run_as_printed(
     elsewhere: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("lqrsim.reports.page.FPS", 1)  # as fast as it gets
+    monkeypatch.setattr("lqrsim.reports.FPS", 1)  # as fast as it gets
     reference = "own file.py:shorter,steps=8"
     assert main(["stress", reference, "--policies", "smooth", "open_loop", *FEW]) == 0
     folder = Path("runs") / "stress" / "my_arena"

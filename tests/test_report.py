@@ -14,7 +14,7 @@ import pytest
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.disturbances import ControlNoise, ForceNoise, MeasurementNoise
-from lqrsim.reports.page import report
+from lqrsim.reports import report
 from lqrsim.stress.analysis import Outcomes
 from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.results import Results
@@ -146,7 +146,7 @@ def test_worst_trials_are_run_again_and_filmed(
 ) -> None:
     if not gl.available():
         pytest.skip("no OpenGL here")
-    monkeypatch.setattr("lqrsim.reports.page.FPS", 1)  # as fast as it gets
+    monkeypatch.setattr("lqrsim.reports.FPS", 1)  # as fast as it gets
     told: list[tuple[int, int]] = []
     path = report(results, tmp_path / "a.html", videos=2, progress=lambda done, total: told.append((done, total)))
     page = Page(path.read_text(encoding="utf-8"))

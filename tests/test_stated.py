@@ -15,7 +15,7 @@ from lqrsim.commands.options import ControllerName
 from lqrsim.commands.stressing import CampaignPolicyName, PolicyName
 from lqrsim.disturbances import AxleMismatch, ControlNoise, MeasurementNoise, MotorLag
 from lqrsim.errors import InputError
-from lqrsim.reports.page import COLOURS, LINES, MARKERS
+from lqrsim.reports import COLOURS, LINES, MARKERS
 from lqrsim.stress.campaign import _code
 from lqrsim.stress.policies import (
     CAMPAIGN_POLICIES,

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from runner import FolderSettings, Result
 
-from lqrsim.reports.page import COLOURS, LINES, MARKERS
+from lqrsim.reports import COLOURS, LINES, MARKERS
 from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress.policies import POLICIES
 from lqrsim.view import style

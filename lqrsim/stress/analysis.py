@@ -217,26 +217,19 @@ def degradation(table: Table, policy: str, sweep: str) -> list[Success]:
     return [success(cell, table[cell]) for cell in sorted(cells, key=lambda cell: cell.strength)]
 
 
-@dataclass(frozen=True)
-class BreakingPoint:
-    """The smallest tried strength at which the interval of the success rate lies below the limit, if there is one."""
-
-    policy: str
-    sweep: str
-    strength: float | None
-    success: Estimate | None
-
-
 @checked
-def breaks(table: Table, *, below: Annotated[float, Bounds(above=0.0, at_most=1.0)] = 0.95) -> list[BreakingPoint]:
-    """The breaking point of each policy and sweep, the weakest first."""
-    breaking_points = []
-    for policy, sweep in dict.fromkeys((cell.policy, cell.sweep) for cell in _checked_table(table)):
-        points = degradation(table, policy, sweep)
-        first = next((point for point in points if point.exact.high < below), None)
-        strength, exact = (None, None) if first is None else (first.cell.strength, first.exact)
-        breaking_points.append(BreakingPoint(policy, sweep, strength, exact))
-    return sorted(breaking_points, key=lambda point: np.inf if point.strength is None else point.strength)
+def breaks(
+    table: Table, *, below: Annotated[float, Bounds(above=0.0, at_most=1.0)] = 0.95
+) -> list[tuple[str, str, Success | None]]:
+    """Where each policy breaks in each sweep, the weakest first.
+
+    It is the smallest tried strength at which the interval of the success rate lies below the limit, if there is one.
+    """
+    points = [
+        (policy, sweep, next((point for point in degradation(table, policy, sweep) if point.exact.high < below), None))
+        for policy, sweep in dict.fromkeys((cell.policy, cell.sweep) for cell in _checked_table(table))
+    ]
+    return sorted(points, key=lambda point: np.inf if point[2] is None else point[2].cell.strength)
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ def run_campaign(
     campaign, folder = copy(campaign), check_path("folder", folder, "the path of a folder")
     workers = processors() if workers is None else workers
     tell = progress or (lambda done, total: None)
-    _check_runnable(campaign)
+    deterministic = _check_runnable(campaign)
     if os.path.isdir(folder) and not os.path.exists(folder / MANIFEST):
         names = (name for name in os.listdir(folder) if not name.startswith(".unfinished-"))
         if others := sorted({*names} - _CAMPAIGN_FILES):
@@ -85,7 +85,7 @@ def run_campaign(
         client = None if scheduler is None else stack.enter_context(executors.connected(scheduler))
         stack.enter_context(_sole_writer(folder))
         stack.enter_context(_resumable(folder, campaign.scenario))
-        specification = _specification(campaign)
+        specification = _specification(campaign) | {"deterministic": deterministic}
         if os.path.exists(folder / MANIFEST):
             _check_same_campaign(specification, read_manifest(folder), folder)
         else:
@@ -174,8 +174,11 @@ def _resumable(folder: Path, scenario: str) -> Iterator[None]:
         raise
 
 
-def _check_runnable(campaign: Campaign) -> None:
-    """Raise InputError for errors that would occur in every trial, before anything is solved or written."""
+def _check_runnable(campaign: Campaign) -> list[list[Any]]:
+    """Raise InputError for errors that would occur in every trial, before anything is solved or written.
+
+    Returns the sweeps and strengths at which nothing is drawn.
+    """
     scenario, given = campaign.resolved, campaign.given
     problem, plant = scenario.problem, scenario.plant()
     impossible = policies.impossible_policies(scenario, given)
@@ -187,13 +190,14 @@ def _check_runnable(campaign: Campaign) -> None:
     if problem.duration is None:
         plant.substeps(problem.dt)
     _ = campaign.goal_options  # raises InputError if they do not fit
+    deterministic = list[list[Any]]()
     for sweep, strength in itertools.product(campaign.sweeps, campaign.strengths):
-        for disturbance in campaign.sweeps[sweep]:
-            scaled = disturbance.scaled(strength)
-            try:
-                _may_draw(campaign, scaled)
-            except InputError as error:
-                raise InputError(f"sweeps: {sweep} at strength {strength:g}: {error}") from None
+        scaled = [disturbance.scaled(strength) for disturbance in campaign.sweeps[sweep]]
+        try:
+            drawn = [_may_draw(campaign, disturbance) for disturbance in scaled]
+        except InputError as error:
+            raise InputError(f"sweeps: {sweep} at strength {strength:g}: {error}") from None
+        deterministic += [] if any(drawn) else [[sweep, strength]]
     if {*policies.DESIGNED} & {*campaign.policies}:
         policies.design_uncertainty(scenario, campaign.design_disturbances)
     for cell in campaign.cells:
@@ -204,6 +208,7 @@ def _check_runnable(campaign: Campaign) -> None:
                 raise InputError(f"policies: {cell.policy} for {cell.sweep}: {error}") from None
     if campaign.replan_every is not None and campaign.replan_every < 0.999 * problem.dt:
         raise InputError(f"replan_every: got {campaign.replan_every:g} s, want at least {problem.dt:g}")
+    return deterministic
 
 
 def _may_draw(campaign: Campaign, disturbance: Disturbance) -> bool:
@@ -264,11 +269,6 @@ def _begin(campaign: Campaign, specification: dict[str, Any], folder: Path) -> N
     write_manifest(folder, specification | {
         "policies": hashes, "versions": versions(), "machine": description(), "remarks": remarks,
         "left_out": f"left out: {missing}" if missing and by_default else "",
-        "deterministic": [
-            [sweep, strength]
-            for sweep, strength in itertools.product(campaign.sweeps, campaign.strengths)
-            if not any(_may_draw(campaign, disturbance.scaled(strength)) for disturbance in campaign.sweeps[sweep])
-        ],
     })  # fmt: skip
 
 
