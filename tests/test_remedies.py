@@ -158,9 +158,10 @@ def test_each_status_that_is_no_success_has_a_case() -> None:
     }
 
 
+@pytest.mark.parametrize("rate", [None, ls.ControlRate(weight=1e-6)])
 @pytest.mark.parametrize(("aside", "mass", "pillar"), [(0.2, 1.0, "pillar"), (-0.18, 3.0, "post")])
 def test_what_a_plan_grazes_is_named_and_among_the_obstacles_it_is_passed(
-    aside: float, mass: float, pillar: str
+    aside: float, mass: float, pillar: str, rate: ls.ControlRate | None
 ) -> None:
     """Without obstacles only MuJoCo's contacts keep a disc from a pillar: plans slide along it and do not converge.
 
@@ -176,7 +177,8 @@ def test_what_a_plan_grazes_is_named_and_among_the_obstacles_it_is_passed(
 
     def solved(clearance: float | None, **obstacles: Any) -> ls.Solution:
         robot = ls.MjcfRobot(scene, **obstacles)
-        stated = robot.problem(robot.at(), robot.at(disc_x=1.0), steps=30, dt=0.04, clearance=clearance)
+        ends = robot.at(), robot.at(disc_x=1.0)
+        stated = robot.problem(*ends, steps=30, dt=0.04, clearance=clearance, control_rate=rate)
         return ls.smooth(stated, starts=1, max_iterations=60, threads=1)
 
     grazing, passing = solved(None, obstacles=False), solved(0.01, obstacles=[pillar])

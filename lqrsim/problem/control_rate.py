@@ -173,7 +173,7 @@ class LastCommand(Dynamics):
         self._period, self.by_mujoco, self.rounding = of.period, of.by_mujoco, of.rounding
         self.period_near, self.check_period = of.period_near, of.check_period
         self.solving, self.quiet, self._with_finer_steps = of.solving, of.quiet, of._with_finer_steps
-        self.touches, self._cause_of_failure = of.touches, of._cause_of_failure
+        self.touches, self.grazed, self._cause_of_failure = of.touches, of.grazed, of._cause_of_failure
         space, controls = of.state_coordinates, of.control_coordinates
         names = list(space.names)
         for name in controls.names:
