@@ -28,8 +28,7 @@ from lqrsim.control.controllers import Controller, ControllerRun, Feedback
 from lqrsim.errors import Array, InputError
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.disturbances import ControlNoise, ForceNoise
-from lqrsim.stress import executors
-from lqrsim.stress.campaign import run_campaign
+from lqrsim.stress.campaign import Job, run_campaign
 from lqrsim.stress.results import Columns, Damaged, Results, differences, replay, unpack
 from lqrsim.stress.study import Campaign, Cell, Shard, Trials
 
@@ -219,7 +218,7 @@ def test_finished_is_finished(reference: Results, monkeypatch: pytest.MonkeyPatc
         raise AssertionError
 
     before = {path: path.stat().st_mtime_ns for path in reference.folder.glob("shards/*")}
-    monkeypatch.setattr(executors.Job, "work", never)
+    monkeypatch.setattr(Job, "work", never)
     run_campaign(CAMPAIGN, reference.folder)
     run_campaign(replace(CAMPAIGN, time_limit=1.0), reference.folder)  # not a part of what is asked
     assert before == {path: path.stat().st_mtime_ns for path in reference.folder.glob("shards/*")}

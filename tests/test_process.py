@@ -241,11 +241,11 @@ def test_no_worker_can_be_interrupted_while_it_starts(tmp_path: Path) -> None:
     """Neither the first, with which Python starts another process, nor the second: the kernel holds SIGINT back."""
     code = tmp_path / "start.py"
     code.write_text(
-        "import time\nfrom pathlib import Path\nfrom lqrsim.stress import executors\n"
+        "import time\nfrom pathlib import Path\nfrom lqrsim.stress import campaign\n"
         "if __name__ == '__main__':\n"
         "    for _ in range(2):\n"
-        "        process = executors._context.Process(target=time.sleep, args=(60,))\n"
-        "        with executors._without_ctrl_c():\n"
+        "        process = campaign._context.Process(target=time.sleep, args=(60,))\n"
+        "        with campaign._without_ctrl_c():\n"
         "            process.start()\n"
         "        status = Path(f'/proc/{process.pid}/status').read_text()\n"
         "        blocked = next(line for line in status.splitlines() if line.startswith('SigBlk'))\n"
@@ -264,12 +264,12 @@ def test_a_worker_starts_no_other_process(tmp_path: Path) -> None:
         "import sys\n"
         "if __name__ == '__mp_main__':\n"
         "    sys.addaudithook(lambda event, _: print(event, flush=True) if event == 'subprocess.Popen' else None)\n"
-        "import mujoco\nfrom lqrsim.stress import executors\n"
+        "import mujoco\nfrom lqrsim.stress import campaign\n"
         "def work():\n"
         "    print('glfw.library' in sys.modules)\n"
         "if __name__ == '__main__':\n"
-        "    process = executors._context.Process(target=work)\n"
-        "    with executors._worker_environment():\n"
+        "    process = campaign._context.Process(target=work)\n"
+        "    with campaign._worker_environment():\n"
         "        process.start()\n"
         "    process.join()\n"
     )
@@ -280,10 +280,10 @@ def test_a_worker_starts_no_other_process(tmp_path: Path) -> None:
 
 INTERRUPTED = """
 import multiprocessing, sys
-from lqrsim.stress import executors
+from lqrsim.stress import campaign
 from lqrsim.stress.study import Shard
 
-class Job(executors.Job):
+class Job(campaign.Job):
     def prepare(self):
         pass
     def work(self, shard):
@@ -301,7 +301,7 @@ def interrupt(number):
 
 if __name__ == "__main__":
     for number in map(int, sys.argv[1:]):
-        run = executors.run_in_processes(Job({}, "", {}, 1), [Shard(0, i, 1) for i in range(40)], 2, 100.0)
+        run = campaign.run_in_processes(Job({}, "", {}, 1), [Shard(0, i, 1) for i in range(40)], 2, 100.0)
         sys.setprofile(interrupt(number))
         try:
             list(run)
