@@ -57,9 +57,9 @@ from .scenes.scene import load_scene as load_scene
 from .scenes.world import Obstacle as Obstacle
 from .scenes.world import World as World
 from .simulation.closed_loop import simulate as simulate
+from .simulation.effects import uncertainty_of as uncertainty_of
 from .simulation.plant import Plant as Plant
 from .simulation.plant_check import check_plant as check_plant
-from .simulation.uncertainty_of import uncertainty_of as uncertainty_of
 from .solvers.gradients import gradients as gradients
 from .solvers.prepared import prepare as prepare
 from .solvers.risk import largest_risk as largest_risk

@@ -18,7 +18,7 @@ from lqrsim.codegen.plain import plain_functions
 from lqrsim.errors import Array
 from lqrsim.problem.constraints import PlainTerm
 from lqrsim.results.solution_parts import Status
-from lqrsim.simulation.uncertainty_of import tube_under
+from lqrsim.simulation.effects import tube_under
 from lqrsim.view.plots import accuracy
 
 DT = 0.1

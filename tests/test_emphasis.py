@@ -12,7 +12,7 @@ from sampling import examples
 
 import lqrsim as ls
 from lqrsim.control import tracking
-from lqrsim.control.collision_chance import Surroundings, collision_chance
+from lqrsim.control.prediction import Surroundings
 from lqrsim.errors import Array
 
 PLACES = ((0.0, 0.1), (0.9, -1.2))
@@ -86,7 +86,7 @@ def test_it_is_the_slope_of_the_chance(seed: int, margin: float, deviation: floa
     found = surroundings.emphasis(states, covariance, across, np.ones(4))
 
     def expected(changed: Array) -> float:
-        return float(-np.log1p(-collision_chance(states, changed, across, surroundings)[1]))
+        return float(-np.log1p(-surroundings.spread(states, changed, across).chance()[1]))
 
     slopes = []
     for t in range(1, 4):

@@ -37,8 +37,8 @@ from lqrsim.results.goal import OF_RANGE, OF_WAY, OUTCOMES, Target
 from lqrsim.robots.base import Robot
 from lqrsim.scenarios.references import disturbance_set
 from lqrsim.scenes.scene import scene_from_xml
+from lqrsim.simulation.effects import tube_under
 from lqrsim.simulation.plant import Plant
-from lqrsim.simulation.uncertainty_of import tube_under
 from lqrsim.stress.analysis import Outcomes, outcomes
 from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.results import Results, differences, replay

@@ -77,7 +77,7 @@ FLOORS_WITHIN = {
         ("between_knots", "free_duration"),
         ("strategy",),
     ),
-    "simulation": (("plant_validation", "simulator"), ("plant",), ("physics",), ("disturbances",)),
+    "simulation": (("simulator",), ("plant",), ("physics",), ("disturbances",)),
 }
 
 # Who may import a heavy package, inside a function too. Type checkers' imports do not count.

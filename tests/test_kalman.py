@@ -57,8 +57,8 @@ def conditional(model: PlanModel, inputs: Array, measured: Array, t: int) -> tup
     for i in range(T):
         rows = slice(i * size, (i + 1) * size)
         if i:
-            to[rows] = model.F[i - 1] @ to[(i - 1) * size : i * size]
-            known[i] = model.F[i - 1] @ known[i - 1] + model.G[i - 1] @ inputs[i - 1] + model.c[i - 1]
+            to[rows] = model.step.F[i - 1] @ to[(i - 1) * size : i * size]
+            known[i] = model.step.F[i - 1] @ known[i - 1] + model.step.G[i - 1] @ inputs[i - 1] + model.step.c[i - 1]
         to[rows, rows] = np.eye(size)
     noise, H = np.zeros((T * size, T * size)), np.zeros((T * model.sensor.size, T * size))
     V, y = np.zeros((len(H), len(H))), np.zeros(len(H))
@@ -119,7 +119,7 @@ def test_an_implausible_measurement_moves_no_unknown_far(case: int, seed: int, t
     inputs, before = commands[:jumps] - plan.controls[:jumps], jumps - 1
     assert run.estimates is not None
     at = run.estimates[:, 0] - law.nominal
-    F, G, c = model.F[before], model.G[before], model.c[before]
+    F, G, c = (part[before] for part in model.step)
     predicted = F @ at[before] + G @ inputs[before] + c
     spread = F @ conditional(model, inputs, off, before)[1] @ F.T + model.process_noise[before]
     mean, left = conditional(model, inputs, off, jumps)
@@ -263,7 +263,7 @@ def test_covariances_stay_positive_without_any_noise() -> None:
     """Sensors without noise make a singular matrix: nothing is less than zero beyond rounding, and nothing is lost."""
     system = linear(np.diag([0.5, -1.0]), [[1.0], [2.0]], [[1.0], [0.0]], controls=np.ones((100, 1)))
     uncertainty = Uncertainty(unknowns=[CONSTANT], start=[1.0, 1e-6], lag=0.05)
-    filtered = kalman_filter(PlanModel.of(system.problem.dynamics, system.plan, uncertainty))
+    filtered = kalman_filter(PlanModel(system.problem.dynamics, system.plan, uncertainty))
     for covariance in (*filtered.predicted, *filtered.corrected):
         assert np.linalg.eigvalsh(covariance).min() > -1e-14
     # A gentle law: the lag of one that needs it would be taken for less.
@@ -357,7 +357,7 @@ def precisely(model: PlanModel, least: Array, t: int) -> tuple[Any, Any]:
     exact, size, count, n = mpmath.matrix, model.size, model.sensor.size, model.n
     to, source = [mpmath.eye(size)], [exact(model.start_root)]
     for i in range(t):
-        to = [exact(model.F[i]) * one for one in to] + [mpmath.eye(size)]
+        to = [exact(model.step.F[i]) * one for one in to] + [mpmath.eye(size)]
         source.append(exact(triangular_root(model.disturbing)[i]))
     # All measured numbers and z_t, as linear functions of the same independent standard normal numbers.
     seen = mpmath.zeros((t + 1) * count, (t + 1) * (size + n + count))
@@ -366,7 +366,7 @@ def precisely(model: PlanModel, least: Array, t: int) -> tuple[Any, Any]:
         reached = source[j]
         for i in range(j, t + 1):
             if i > j:
-                reached = exact(model.F[i - 1]) * reached
+                reached = exact(model.step.F[i - 1]) * reached
             seen[i * count : (i + 1) * count, j * size : (j + 1) * size] = exact(model.H[i]) * reached[:n, :]
         last[:, j * size : (j + 1) * size] = reached
         noise = (t + 1) * size + j * (n + count)
@@ -386,7 +386,7 @@ def test_exact_and_redundant_sensors_lose_no_digits(name: str, noise: float) -> 
     )
     uncertainty = Uncertainty(unknowns=unknowns, start=[1.0, 1e-3], lag=0.06, measurement=noise, control=1e-2)
     law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, sensors=sensors)
-    bare = PlanModel.of(system.problem.dynamics, system.plan, uncertainty, law.model.sensor)
+    bare = PlanModel(system.problem.dynamics, system.plan, uncertainty, law.model.sensor)
     for model in (law.model, bare):  # with and without the least errors that OffsetFree assumes
         found, t = kalman_filter(model), model.plan.steps
         seen = model.H @ found.predicted[:, : model.n, : model.n] @ model.H.transpose(0, 2, 1)

@@ -33,11 +33,11 @@ from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.printer import Program
 from lqrsim.codegen.sources import Scope, ScopedFunction, Source, source_of, text_source
 from lqrsim.codegen.user_functions import numbers_of
-from lqrsim.control import kalman, linear_loop, tracking_laws
+from lqrsim.control import kalman, prediction, tracking
 from lqrsim.control.controllers import turning_of
+from lqrsim.control.offset_free import with_filter
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.tracking import with_filter
-from lqrsim.control.tracking_laws import Weights
+from lqrsim.control.tracking import Weights
 from lqrsim.disturbances import Uncertainty, Unknown
 from lqrsim.errors import Array
 from lqrsim.kernels import (
@@ -53,6 +53,7 @@ from lqrsim.kernels import (
     mjcf_dynamics,
     model_functions,
     passes,
+    recursions,
     restoration,
     riccati,
     rotation_ratios,
@@ -1304,15 +1305,15 @@ class TestDesigns:
             unknowns=[Unknown("d0", 0.7), Unknown("gain of u1", 0.1)], start=0.3, measurement=0.1, control=0.2,
             lag=0.06, command_loss=0.1, loss=0.1,
         )  # fmt: skip
-        model = PlanModel.of(system.problem.dynamics, system.plan, told)
+        model = PlanModel(system.problem.dynamics, system.plan, told)
         weights = Weights(rng.uniform(1, 2, (2, 3)), np.ones(controls), rng.uniform(1, 2, (2, 3)))
         limits = np.full(controls, -1.0), np.full(controls, 1.5)
 
         def design() -> list[Array]:
             filtered = kalman.kalman_filter(model, known=np.tril(rng_of_root.normal(size=(model.size,) * 2)))
             filtered_from_start = kalman.kalman_filter(model)
-            laws = tracking_laws.tracking_laws(model, weights)
-            loop = linear_loop.LinearLoop(model, *laws, filtered_from_start.gain, limits)
+            laws = tracking.tracking_laws(model, weights)
+            loop = prediction.LinearLoop(model, *laws, filtered_from_start.gain, limits)
             return [
                 *filtered,
                 *filtered_from_start,
@@ -1336,8 +1337,8 @@ class TestDesigns:
             def __getattr__(self, name: str) -> Callable[..., Any]:
                 return self.lay_out(name)
 
-        for module in (kalman, tracking_laws, linear_loop):
-            monkeypatch.setattr(module, "module_of", lambda source, what: Plain(source))
+        for module in (kalman, tracking, prediction):
+            monkeypatch.setattr(module, "recursions", lambda: Plain(source_of(recursions)))
         rng_of_root = np.random.default_rng(0)
         for found, compiled_one in zip(design(), wanted, strict=True):
             np.testing.assert_allclose(found, compiled_one, rtol=0, atol=1e-9 * max(1.0, np.abs(compiled_one).max()))

@@ -13,8 +13,7 @@ from sampling import examples
 import lqrsim as ls
 from lqrsim.codegen import compiled_module
 from lqrsim.kernels.declarations import ROW
-from lqrsim.simulation.closed_loop import simulate_from
-from lqrsim.simulation.collisions import FINEST
+from lqrsim.simulation.closed_loop import FINEST, simulate_from
 
 ACROSS = balls((0.0, -2.0, 0.5), velocity=(0.0, 2.0))  # in the middle of the way when the mass would be there
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from tracking import track
 
 import lqrsim as ls
-from lqrsim.control.collision_chance import Surroundings
+from lqrsim.control.prediction import Surroundings
 from lqrsim.errors import Array
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.scenes.world import KINDS, PLANES

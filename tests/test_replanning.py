@@ -2,7 +2,6 @@
 
 import itertools
 import threading
-import time
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -477,9 +476,8 @@ def live(stated: ls.Problem, solution: ls.Solution, *, clock: Any, **options: An
 
 def ready(planner: ls.types.LiveReplanner) -> None:
     """Wait for the answer that the planner's thread is at."""
-    solve = planner._solve
-    while solve is not None and solve.answer is None and solve.error is None:
-        time.sleep(1e-3)
+    if planner._solve is not None:
+        planner._solve[1].exception()
 
 
 @pytest.mark.parametrize("cost", [1.0, np.float64(1.0), np.inf, np.float64("inf"), np.nan, np.float64("nan")])
@@ -523,7 +521,7 @@ class TestLive:
         state, late = solution.trajectory.states[3], 0.04
         with live(stated, solution, every=DT, clock=lambda: 0.0) as planner:
             control = planner.step(state, 3 * DT + late)
-            begun = planner._solve.request.state  # pyright: ignore[reportOptionalMemberAccess]
+            begun = planner._solve[0].state  # pyright: ignore[reportOptionalSubscript]
             h = DT - late
             there = np.concatenate([state[:2] + h * state[2:] + h**2 / 2 * control, state[2:] + h * control])
             np.testing.assert_allclose(begun, there, rtol=0, atol=1e-12)

@@ -44,7 +44,7 @@ from lqrsim.errors import (
 from lqrsim.machine import memory
 from lqrsim.problem.costs import CostTerm
 from lqrsim.results.solution_parts import BetweenKnots
-from lqrsim.simulation.uncertainty_of import tube_under
+from lqrsim.simulation.effects import tube_under
 from lqrsim.stress import Campaign
 from lqrsim.stress.statistics import rate
 

@@ -13,7 +13,8 @@ from sampling import examples
 from tracking import hover
 
 import lqrsim as ls
-from lqrsim.control.sensor_filter import SensorFilter, SensorRun
+from lqrsim.control.kalman import SensorFilter
+from lqrsim.control.offset_free import SensorRun
 from lqrsim.disturbances import (
     ControlNoise,
     Disturbance,
@@ -322,12 +323,12 @@ def test_estimates_are_least_squares(on_track, rates, late, biased, loss, seed):
         np.testing.assert_allclose(
             run.estimate.covariance[0, :2, :2], maps[t] @ covariance @ maps[t].T, rtol=1e-5, atol=1e-9
         )
-        following = model.F[t] @ maps[t]
+        following = model.step.F[t] @ maps[t]
         following[:, 2 + 2 * t : 4 + 2 * t] += np.eye(n)
         maps.append(following)
         x_next = solution.trajectory.states[t + 1]
-        x_next = x_next + model.F[t] @ (nominal[t] - solution.trajectory.states[t])
-        nominal.append(x_next + model.G[t] @ (u - solution.trajectory.controls[t]))
+        x_next = x_next + model.step.F[t] @ (nominal[t] - solution.trajectory.states[t])
+        nominal.append(x_next + model.step.G[t] @ (u - solution.trajectory.controls[t]))
 
 
 def test_errors_of_estimates_are_as_large_as_the_filter_says(cage, law):

@@ -16,11 +16,11 @@ from scipy.linalg import expm
 from sympy import cos, exp, sin
 
 import lqrsim as ls
-from lqrsim.control import tracking
 from lqrsim.control.kalman import kalman_filter
-from lqrsim.control.linear_loop import LinearLoop, kernels
-from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.tracking_laws import Laws, Weights, tracking_laws
+from lqrsim.control.offset_free import with_filter
+from lqrsim.control.plan_model import PlanModel, recursions
+from lqrsim.control.prediction import LinearLoop
+from lqrsim.control.tracking import Laws, Weights, tracking_laws
 from lqrsim.disturbances import Uncertainty, Unknown
 from lqrsim.errors import Array
 
@@ -154,7 +154,7 @@ def test_laws_are_dense_least_squares_of_the_same_cost(structure: int, seed: int
     """Commands of a run that begins anywhere, within 1e-6 of their size: `undo` leaves 1e-9 of its matrix unsolved."""
     system, uncertainty = drawn(structure, seed, unstable=unstable)
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
-    model = PlanModel.of(system.problem.dynamics, system.plan, uncertainty)
+    model = PlanModel(system.problem.dynamics, system.plan, uncertainty)
     weights = weights_of(rng, n, m, system.plan.steps)
     gain, offset = tracking_laws(model, weights)
     oracle = Oracle(system, uncertainty, weights, persistent=True)
@@ -166,7 +166,7 @@ def test_laws_are_dense_least_squares_of_the_same_cost(structure: int, seed: int
         u = gain[t] @ z + offset[t]
         # Seed 13815 of structure 2 is off by 2.4e-6: a least-squares problem squares what a Riccati recursion does not.
         np.testing.assert_allclose(system.plan.controls[t] + u, commands[t], rtol=0, atol=1e-5 * (1 + np.abs(u).max()))
-        z = model.F[t] @ z + model.G[t] @ u + model.c[t]
+        z = model.step.F[t] @ z + model.step.G[t] @ u + model.step.c[t]
         z[n + model.lagging :] = d
 
 
@@ -185,7 +185,7 @@ def test_laws_of_commands_that_get_lost_are_least_squares_over_all_that_may(
     system, uncertainty = drawn(structure, seed, unstable=unstable, steps=steps)
     uncertainty = dataclasses.replace(uncertainty, command_loss=share)
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
-    model = PlanModel.of(system.problem.dynamics, system.plan, uncertainty)
+    model = PlanModel(system.problem.dynamics, system.plan, uncertainty)
     weights = weights_of(rng, n, m, system.plan.steps)
     gain, offset = tracking_laws(model, weights)
     oracle = Oracle(system, uncertainty, weights, persistent=True)
@@ -217,7 +217,7 @@ def test_moments_of_several_laws_are_those_of_a_plain_recursion(structure: int, 
         uncertainty, command_loss=share, start=0.3, measurement=0.1, control=0.2, model_error=0.05
     )
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
-    model, steps = PlanModel.of(system.problem.dynamics, system.plan, uncertainty), system.plan.steps
+    model, steps = PlanModel(system.problem.dynamics, system.plan, uncertainty), system.plan.steps
     gain, offset = rng.normal(size=(3, steps, m, n)), rng.normal(size=(3, steps, m))
     limits = np.full(m, -1.0), np.full(m, 1.5)
     found = LinearLoop(model, gain, offset, None, limits).moments(n)
@@ -233,7 +233,9 @@ def test_moments_of_several_laws_are_those_of_a_plain_recursion(structure: int, 
             noise = gain[i, t] @ shown @ gain[i, t].T
             std = np.sqrt(np.diag(law @ P @ law.T + noise))
             centre = planned + offset[i, t] + law @ x
-            slope, level, left = np.array([kernels().limit(*one) for one in zip(centre, std, *limits, strict=True)]).T
+            slope, level, left = np.array(
+                [recursions().limit(*one) for one in zip(centre, std, *limits, strict=True)]
+            ).T
             law, noise = np.diag(slope) @ law, np.diag(slope) @ noise @ np.diag(slope) + np.diag(left)
             cases = [(1 - share, law, level - planned, noise)]
             if share:  # the command in force stays
@@ -258,11 +260,11 @@ def test_choosing_predicts_the_moments_of_the_whole_recursion(structure: int, se
     system, uncertainty = drawn(structure, seed, unstable=False)
     uncertainty = dataclasses.replace(uncertainty, start=0.3, measurement=0.1, control=0.2, model_error=0.05)
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
-    model, steps = PlanModel.of(system.problem.dynamics, system.plan, uncertainty), system.plan.steps
+    model, steps = PlanModel(system.problem.dynamics, system.plan, uncertainty), system.plan.steps
     laws = Laws(rng.normal(size=(3, steps, m, model.size)), rng.normal(size=(3, steps, m)))
     bounds = (np.full(m, -1.0), np.full(m, 1.5)) if limits else (np.full(m, -np.inf), np.full(m, np.inf))
     filtered = kalman_filter(model)
-    part = tracking.with_filter(model, filtered, bounds, laws)
+    part = with_filter(model, filtered, bounds, laws)
     whole = LinearLoop(model, *laws, filtered.gain, bounds).moments(n)
     for found, wanted in zip(part, whole, strict=True):
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9 * max(1.0, np.abs(wanted).max()))
@@ -276,7 +278,7 @@ def test_moments_of_commands_that_get_lost_are_those_of_all_patterns(structure: 
     system, uncertainty = drawn(structure, seed, unstable=False, steps=steps)
     uncertainty = dataclasses.replace(uncertainty, command_loss=share, start=0.3, unknowns=())
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
-    model = PlanModel.of(system.problem.dynamics, system.plan, uncertainty)
+    model = PlanModel(system.problem.dynamics, system.plan, uncertainty)
     gain, offset, no = rng.normal(size=(steps, m, n)), rng.normal(size=(steps, m)), np.zeros(0)
     moments = LinearLoop(model, gain, offset, None, (np.full(m, -np.inf), np.full(m, np.inf))).moments()
     oracle = Oracle(system, uncertainty, Weights(np.ones(n), np.ones(m), np.ones(n)))
@@ -308,14 +310,14 @@ def test_the_linear_model_is_the_run(structure: int, seed: int, unstable: bool) 
     """F, G and c against the oracle's run, which is stated as absolute numbers: 1e-9."""
     system, uncertainty = drawn(structure, seed, unstable=unstable)
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
-    model = PlanModel.of(system.problem.dynamics, system.plan, uncertainty)
+    model = PlanModel(system.problem.dynamics, system.plan, uncertainty)
     oracle = Oracle(system, uncertainty, Weights(np.ones(n), np.ones(m), np.ones(n)))
     e, a, d = rng.normal(size=n), rng.normal(size=m), rng.normal(size=oracle.states_of_unknowns)
     changes = rng.normal(size=(system.plan.steps, m))
     z, seen = np.concatenate([e, a[: model.lagging], d]), []
     for t in range(system.plan.steps):
         seen.append(z[:n])
-        z = model.F[t] @ z + model.G[t] @ changes[t] + model.c[t]
+        z = model.step.F[t] @ z + model.step.G[t] @ changes[t] + model.step.c[t]
     run = oracle.residuals(system.plan.controls + changes, e, a, d)
     expected = np.stack([*run[:-n].reshape(-1, n + m)[:, :n], run[-n:]])
     np.testing.assert_allclose([*seen, z[:n]], expected, rtol=0, atol=1e-9 * (1 + np.abs(expected).max()))
@@ -332,7 +334,7 @@ def test_they_are_the_same_in_any_units_of_the_controls(seed: int, unstable: boo
     )  # fmt: skip
     weights, laws = weights_of(np.random.default_rng(seed + 1), 3, 2, usual.plan.steps), []
     for system, unit in ((usual, np.ones(2)), (other, units)):
-        model = PlanModel.of(system.problem.dynamics, system.plan, uncertainty)
+        model = PlanModel(system.problem.dynamics, system.plan, uncertainty)
         gain, offset = tracking_laws(model, dataclasses.replace(weights, control=weights.control * unit**2))
         entries = np.ones(model.size)
         entries[3:5] = unit  # what the actuators have reached
@@ -358,7 +360,7 @@ def test_effects_of_a_parameter_are_its_derivatives_whatever_its_size(exponent: 
     for torque in controls:
         states.append(dynamics.step(states[-1], torque, DT))
     plan = ls.Trajectory(np.array(states), controls, DT)
-    model = PlanModel.of(dynamics, plan, Uncertainty(unknowns=[Unknown("inertia", 0.1 * inertia)]))
+    model = PlanModel(dynamics, plan, Uncertainty(unknowns=[Unknown("inertia", 0.1 * inertia)]))
     wanted = -(1.5 + control) / inertia * np.array([DT**2 / 2, DT])
     np.testing.assert_allclose(model.effects[:, :, 0], np.tile(wanted, (4, 1)), rtol=1e-4)
 

@@ -7,7 +7,7 @@ import pytest
 
 import lqrsim as ls
 from lqrsim.disturbances import ControlDelay, ControlNoise, MeasurementLatency, MeasurementNoise, Push
-from lqrsim.simulation.uncertainty_of import tube_under
+from lqrsim.simulation.effects import tube_under
 
 NOISE = ControlNoise(0.05)
 

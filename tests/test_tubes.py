@@ -14,11 +14,9 @@ from scipy.integrate import quad
 from scipy.stats import binomtest, multivariate_normal, norm
 
 import lqrsim as ls
-from lqrsim.control.collision_chance import Surroundings, both_below, collision_chance
 from lqrsim.control.controllers import Feedback
-from lqrsim.control.linear_loop import LinearLoop, kernels
-from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.sampled_loop import DeviationNorm, SampledLoop, sample_loop
+from lqrsim.control.plan_model import PlanModel, recursions
+from lqrsim.control.prediction import DeviationNorm, LinearLoop, SampledLoop, Surroundings, both_below, sample_loop
 from lqrsim.disturbances import Uncertainty
 from lqrsim.errors import Array
 from lqrsim.kernels.records import LoopMoments
@@ -74,7 +72,7 @@ def test_limited_moments_are_those_of_quadrature(
     """Slope, mean and what is left of the variance of a clipped normal number, to 1e-8."""
     high = low + width
     lowest, highest = (low if sides != "high" else -np.inf), (high if sides != "low" else np.inf)
-    slope, mean, left = kernels().limit(centre, std, lowest, highest)
+    slope, mean, left = recursions().limit(centre, std, lowest, highest)
 
     def expected(function: Any) -> float:
         # In pieces, for a narrow peak in a wide interval is beyond the quadrature.
@@ -105,7 +103,7 @@ def test_the_chance_of_collision_beside_a_plane_is_that_of_monte_carlo() -> None
     surroundings = _among(wall, radius=0.0, std=0.0)
     std = 0.1
     covariance = np.tile(np.diag([0.05, std]) ** 2, (steps + 1, 1, 1))
-    each, total = collision_chance(np.zeros((steps + 1, 2)), covariance, keep * covariance[1:], surroundings)
+    each, total = surroundings.spread(np.zeros((steps + 1, 2)), covariance, keep * covariance[1:]).chance()
     rng = np.random.default_rng(0)
     y = std * rng.normal(size=paths)
     hit, entries = y < -0.2, float((y < -0.2).mean())
@@ -143,9 +141,7 @@ def test_the_same_obstacles_count_once_however_often_they_are_stated(stated: lis
         costs=tuple(ls.ObstacleCost(one, radius=stated[0][2], sharpness=10.0) for one in (worlds[0], twice)),
     )  # fmt: skip
     still, spread = np.zeros((3, 2)), np.tile(np.diag([0.1, 0.1]) ** 2, (3, 1, 1))
-    found = [
-        collision_chance(still, spread, spread[1:], one)[1] for one in (alone, Surroundings.of(system.problem, 0.1))
-    ]
+    found = [one.spread(still, spread, spread[1:]).chance()[1] for one in (alone, Surroundings.of(system.problem, 0.1))]
     assert found[0] == found[1] > 0
 
 
@@ -171,7 +167,7 @@ def test_two_obstacles_and_one_that_is_displaced() -> None:
     ]
     surroundings = _among(ls.World(balls), radius=0.2, std=0.04)
     covariance = np.tile(np.diag([0.03, 0.3]) ** 2, (1, 1, 1))
-    each, total = collision_chance(np.zeros((1, 2)), covariance, np.zeros((0, 2, 2)), surroundings)
+    each, total = surroundings.spread(np.zeros((1, 2)), covariance, np.zeros((0, 2, 2))).chance()
     expected = norm.cdf(-0.3 / 0.05) + norm.cdf(-0.5 / 0.05)
     assert each[0] == pytest.approx(expected, rel=1e-9)
     assert total == pytest.approx(-np.expm1(-expected), rel=1e-9)
@@ -318,7 +314,7 @@ def test_sampled_moments_of_a_linear_system_are_those_of_its_matrices(estimates:
     else:
         tolerate = {"s0": 0.1, "s1": 0.5}
         policy = ls.track(system.problem, system.solution, tolerate=tolerate, effort=0.5, uncertainty=stated)
-        controller, model = Feedback(policy), PlanModel.of(system.problem.dynamics, system.plan, stated)
+        controller, model = Feedback(policy), PlanModel(system.problem.dynamics, system.plan, stated)
         offset = np.einsum("tij,tj->ti", policy.gain, system.plan.states[:-1]) + policy.offset - system.plan.controls
         loop = LinearLoop(model, policy.gain, offset, None, (np.full(1, -1e6), np.full(1, 1e6)))
     moments, n = loop.moments(), loop.model.n
@@ -459,7 +455,7 @@ def test_effects_are_those_of_finite_differences(quadrotor: ls.Scenario) -> None
         states.append(dynamics.step(states[-1], control, dt))
     plan = ls.Trajectory(np.array(states), controls, dt)
     names = ["wind_x", "force_z", "torque_y", "mass", "gain of rotor_2", "offset of rotor_3"]
-    model = PlanModel.of(dynamics, plan, Uncertainty(unknowns=[ls.disturbances.Unknown(name, 1.0) for name in names]))
+    model = PlanModel(dynamics, plan, Uncertainty(unknowns=[ls.disturbances.Unknown(name, 1.0) for name in names]))
     h = 1e-4
     for t in range(3):
         for i, name in enumerate(names):

@@ -5,7 +5,6 @@ import os
 import re
 import signal
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -33,19 +32,18 @@ BEFORE: list[threading.Thread] = []  # those of other tests in this process
 
 @pytest.fixture(autouse=True)
 def count_from_here() -> None:
-    BEFORE[:] = [thread for thread in threading.enumerate() if thread.name == "lqrsim re-planner"]
+    BEFORE[:] = [thread for thread in threading.enumerate() if thread.name.startswith("lqrsim re-planner")]
 
 
 def planning() -> list[threading.Thread]:
-    threads = [thread for thread in threading.enumerate() if thread.name == "lqrsim re-planner"]
+    threads = [thread for thread in threading.enumerate() if thread.name.startswith("lqrsim re-planner")]
     return [thread for thread in threads if thread not in BEFORE]
 
 
 def wait_for(planner: ls.types.LiveReplanner) -> None:
     """For the answer that its thread is at."""
-    solve = planner._solve
-    while solve is not None and solve.answer is None and solve.error is None:
-        time.sleep(1e-3)
+    if planner._solve is not None:
+        planner._solve[1].exception()
 
 
 class Run:
@@ -218,7 +216,7 @@ def test_no_thread_is_left(how: str, quadrotor: ls.Scenario, quadrotor_solution:
     run.acts.append(act)
     with contextlib.suppress(KeyboardInterrupt):
         run.go()
-    assert set(seen) == {1}
+    assert max(seen) == seen[-1] == 1  # from the first solve on
     assert planning() == []
     runs = 1 + (how in ("started again", "lost"))
     assert len(run.planners) == runs

@@ -223,7 +223,7 @@ class Solve:
 def _plot_policy(scenario: "ls.Scenario", solution: "ls.Solution", path: Path) -> "ls.types.Tube | None":
     """Plot the policy of a solution of a scenario, which has its duration. Returns the tube, if one is predicted."""
     from lqrsim.problem.belief import Belief
-    from lqrsim.simulation.uncertainty_of import tube_under
+    from lqrsim.simulation.effects import tube_under
 
     tube, remark = tube_under(scenario.problem, solution, scenario.plant(), scenario.disturbances)
     if remark:
@@ -284,7 +284,7 @@ class Simulate:
 
     def run(self) -> int:
         from lqrsim.scenarios.references import disturbance_set
-        from lqrsim.simulation.uncertainty_of import tube_under
+        from lqrsim.simulation.effects import tube_under
         from lqrsim.stress.policies import DEFAULT_DESIGN, DESIGNED, check_designed, make_controller
 
         if self.open_loop and self.controller != "feedback":
@@ -449,7 +449,7 @@ class Demo:
     json: Json = False
 
     def run(self) -> int:
-        from lqrsim.control.belief_feedback import BeliefFeedback
+        from lqrsim.control.controllers import BeliefFeedback
         from lqrsim.scenarios.references import folder_name, from_anywhere, resolve
         from lqrsim.stress.policies import make_controller
         from lqrsim.view import cameras, gl

@@ -1,7 +1,7 @@
 """Plans whose chance of collision is bounded, by a clearance from obstacles at each step.
 
 The clearance at a step is a multiple of the standard deviation of the robot's predicted position. The multiple is the
-same for all steps. It is chosen so that the chance of any collision, as `collision_chance.py` computes it, equals the
+same for all steps. It is chosen so that the chance of any collision, as `prediction.py` computes it, equals the
 requested one. Each plan has its own tube, so the multiple is found by solving again a few times.
 
 If no clearance is safe enough, or there is no room for it, the weights of the obstacles are raised instead. Such plans
@@ -16,8 +16,8 @@ import numpy as np
 from scipy.special import ndtri
 
 from lqrsim.annotations import Chance, Count, Finite, Positive, TextProgress, Want, checked
-from lqrsim.control.collision_chance import LARGEST_MARGIN, Spread, Surroundings, chance_of_clearances
 from lqrsim.control.offset_free import OffsetFree
+from lqrsim.control.prediction import LARGEST_MARGIN, Spread, Surroundings
 from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import InputError
@@ -293,8 +293,9 @@ class _Search:
         to it. Where trials collide although the moments hardly know of a collision, with a chance of 1e-50 or 0, that
         number says nothing, and only the limit holds.
         """
-        clearance, std, correlation, _ = self._spread(plan)
-        clearance = np.where(clearance <= self.margin + np.minimum(HELD, std), -np.inf, clearance)
+        spread = self._spread(plan)
+        held = spread.mean <= self.margin + np.minimum(HELD, spread.std)
+        clearance = np.where(held, -np.inf, spread.mean)
         # The moments are assumed to misjudge the next plan's chance by the same factor as this plan's.
         wanted, tube = AIM * self.asked, plan.tube
         if tube.collision_chance > 0:
@@ -302,8 +303,7 @@ class _Search:
         low, high = 0.0, LARGEST_MARGIN
         for _ in range(40):
             middle = (low + high) / 2
-            moved = np.maximum(clearance, middle * std)
-            safe = chance_of_clearances(moved / std, correlation)[1] <= wanted
+            safe = spread._replace(mean=np.maximum(clearance, middle * spread.std)).chance()[1] <= wanted
             low, high = (low, middle) if safe else (middle, high)
         return min(high, WIDEN * self.deviations)
 

@@ -24,11 +24,11 @@ from lqrsim.codegen import symbolic
 from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
 from lqrsim.codegen.sources import Source, source_of, text_source
 from lqrsim.codegen.user_functions import check_signature, name_of
-from lqrsim.control.controllers import turning_of
-from lqrsim.control.uncertainty import GAIN, OFFSET, ShapingFilter, Uncertainty, Unknown, per_entry, shaping_filter
+from lqrsim.control.uncertainty import GAIN, OFFSET, Uncertainty, Unknown, per_entry, shaping_filter
 from lqrsim.errors import Array, InputError, check_array, check_items, check_name, excerpt
 from lqrsim.kernels import feedback
-from lqrsim.kernels.records import AngularStates, DynamicsModel, Predictor, SensorModel
+from lqrsim.kernels import recursions as recursion_kernels
+from lqrsim.kernels.records import Predictor, SensorModel
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.solution_parts import Trajectory
@@ -134,30 +134,66 @@ class Step(NamedTuple):
     c: Array  # (T, Z)
 
 
-@dataclass(frozen=True, eq=False)
 class PlanModel:
-    """A plan and its uncertainty, linearised."""
+    """A plan and its uncertainty, linearised.
 
-    dynamics: Dynamics
-    plan: Trajectory
-    uncertainty: Uncertainty
-    sensor: Sensor
+    Attributes:
+      n, m: numbers of states and of controls. lagging: number of entries of z for the actuators. size: that of all.
+      lag: the lag, as a mean over commands that arrive and commands that get lost.
+      parameters: the parameters of the dynamics that are unknown.
+      remembered: the unknowns that have states. unknown_states: for each of these, the indices of its states.
+      transition: transition matrix of the unknowns' states, (D, D).
+      output: from these to values of the parameters, and the gain and the offset of each control, (P + 2 m, D).
+      measurement_std: standard deviation of the noise on each measured state, (n,).
+    """
 
-    @classmethod
-    def of(
-        cls, dynamics: Dynamics, plan: Trajectory, uncertainty: Uncertainty, sensor: Sensor | None = None
-    ) -> "PlanModel":
+    def __init__(
+        self, dynamics: Dynamics, plan: Trajectory, uncertainty: Uncertainty, sensor: Sensor | None = None
+    ) -> None:
         uncertainty.check(dynamics)
-        return cls(dynamics.disturbed, plan, uncertainty, sensor or sensor_of(None, dynamics.state_coordinates))
+        self.dynamics, self.plan, self.uncertainty = dynamics.disturbed, plan, uncertainty
+        self.sensor = sensor or sensor_of(None, dynamics.state_coordinates)
+        self.n, self.m = plan.states.shape[1], plan.controls.shape[1]
+        lost, arrived = uncertainty.command_loss, Lag.of(uncertainty.lag, plan.dt)
+        self.lagging = self.m if uncertainty.lag > 0 or lost > 0 else 0
+        self.lag = Lag(lost + (1 - lost) * arrived.left, lost + (1 - lost) * arrived.mean)
+        named = dict.fromkeys(name for unknown in uncertainty.unknowns for name in unknown.shares)
+        self.parameters = tuple(name for name in named if name in self.dynamics.parameters)
+        self.remembered = tuple(unknown for unknown in uncertainty.unknowns if not unknown.white)
+        self._filters = [shaping_filter(unknown, plan.dt) for unknown in self.remembered]
+        ends = np.cumsum([0, *(len(shaping.output) for shaping in self._filters)])
+        self.unknown_states = [range(first, end) for first, end in pairwise(ends.tolist())]
+        self.transition = _diagonal([shaping.transition for shaping in self._filters])
+        columns = [
+            self._weights(unknown)[:, None] * shaping.output
+            for unknown, shaping in zip(self.remembered, self._filters, strict=True)
+        ]
+        self.output = np.concatenate([np.zeros((len(self.parameters) + 2 * self.m, 0)), *columns], axis=1)
+        self.size = self.n + self.lagging + len(self.transition)
+        states = dynamics.state_coordinates
+        self.measurement_std = per_entry("Uncertainty: measurement", uncertainty.measurement, states)
+
+    def _weights(self, unknown: Unknown) -> Array:
+        """The weights of an unknown in the parameters, and the gain and the offset of each control, (P + 2 m,)."""
+        controls, count = self.dynamics.control_coordinates.names, len(self.parameters)
+        weights = np.zeros(count + 2 * self.m)
+        for name, weight in unknown.shares.items():
+            if name.startswith(GAIN):
+                weights[count + controls.index(name.removeprefix(GAIN))] = weight
+            elif name.startswith(OFFSET):
+                weights[count + self.m + controls.index(name.removeprefix(OFFSET))] = weight
+            else:
+                weights[self.parameters.index(name)] = weight
+        return weights
 
     def under(self, uncertainty: Uncertainty) -> "PlanModel":
         """The model for another uncertainty, with the derivatives along the plan that are known already."""
-        other = replace(self, uncertainty=uncertainty)
-        same = ["compiled_dynamics", "jacobian", "H"] + ["effects"] * (self.parameters == other.parameters)
+        other = PlanModel(self.dynamics, self.plan, uncertainty, self.sensor)
+        same = ["jacobian"] + ["effects"] * (self.parameters == other.parameters)
         vars(other).update((name, getattr(self, name)) for name in same)
         return other
 
-    @cached_property
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of the entries of z for messages, (Z,)."""
         names = [*self.dynamics.state_coordinates.names]
@@ -166,88 +202,7 @@ class PlanModel:
             names += [unknown.name] * len(states)
         return tuple(names)
 
-    # Sizes.
-
-    @property
-    def n(self) -> int:
-        return self.plan.states.shape[1]
-
-    @property
-    def m(self) -> int:
-        return self.plan.controls.shape[1]
-
-    @cached_property
-    def lagging(self) -> int:
-        """Number of entries of z for the actuators."""
-        return self.m if self.uncertainty.lag > 0 or self.uncertainty.command_loss > 0 else 0
-
-    @cached_property
-    def lag(self) -> Lag:
-        """The lag, as a mean over commands that arrive and commands that get lost."""
-        lost, arrived = self.uncertainty.command_loss, Lag.of(self.uncertainty.lag, self.plan.dt)
-        return Lag(lost + (1 - lost) * arrived.left, lost + (1 - lost) * arrived.mean)
-
-    @cached_property
-    def remembered(self) -> tuple[Unknown, ...]:
-        """The unknowns that have states."""
-        return tuple(unknown for unknown in self.uncertainty.unknowns if not unknown.white)
-
-    @cached_property
-    def unknown_states(self) -> list[range]:
-        """For each remembered unknown, the indices of its states."""
-        ends = np.cumsum([0, *(len(shaping.output) for shaping in self._filters)])
-        return [range(first, end) for first, end in pairwise(ends.tolist())]
-
-    @property
-    def size(self) -> int:
-        """Number of entries of z."""
-        return self.n + self.lagging + len(self.transition)
-
-    # Effects of the unknowns.
-
-    @cached_property
-    def parameters(self) -> tuple[str, ...]:
-        """The parameters of the dynamics that are unknown."""
-        named = (name for unknown in self.uncertainty.unknowns for name in unknown.shares)
-        return tuple(dict.fromkeys(name for name in named if name in self.dynamics.parameters))
-
-    @cached_property
-    def _filters(self) -> list[ShapingFilter]:
-        return [shaping_filter(unknown, self.plan.dt) for unknown in self.remembered]
-
-    @cached_property
-    def transition(self) -> Array:
-        """Transition matrix of the unknowns' states, (D, D)."""
-        return _diagonal([shaping.transition for shaping in self._filters])
-
-    @cached_property
-    def output(self) -> Array:
-        """From the unknowns' states to values of the parameters, and the gain and the offset of each control."""
-        columns = [
-            self._column(unknown)[:, None] * shaping.output
-            for unknown, shaping in zip(self.remembered, self._filters, strict=True)
-        ]
-        return np.concatenate([np.zeros((len(self.parameters) + 2 * self.m, 0)), *columns], axis=1)
-
-    def _column(self, unknown: Unknown) -> Array:
-        """The weights of an unknown in these values, (P + 2 m,)."""
-        controls, count = self.dynamics.control_coordinates.names, len(self.parameters)
-        column = np.zeros(count + 2 * self.m)
-        for name, weight in unknown.shares.items():
-            if name.startswith(GAIN):
-                column[count + controls.index(name.removeprefix(GAIN))] = weight
-            elif name.startswith(OFFSET):
-                column[count + self.m + controls.index(name.removeprefix(OFFSET))] = weight
-            else:
-                column[self.parameters.index(name)] = weight
-        return column
-
-    @cached_property
-    def predictor(self) -> Predictor:
-        lag = np.array([self.lag.left, self.lag.mean])
-        return Predictor(self.compiled_dynamics, self.plan.dt, self.places, lag, self.transition, self.output)
-
-    # Along the plan.
+    # For compiled code.
 
     @cached_property
     def compiled(self) -> CompiledModule:
@@ -255,15 +210,18 @@ class PlanModel:
         unknown = len(self.parameters)
         source = source_of(
             feedback, LAG=self.lagging, D=len(self.transition), Y=self.sensor.size, P=unknown, Z=self.size,
-            V=unknown + 2 * self.m, NUMBERS=len(self.compiled_dynamics.parameters),
+            V=unknown + 2 * self.m, NUMBERS=len(self.predictor.dynamics.parameters),
             PADDED_D=max(len(self.transition), 1),
         )  # fmt: skip
         label = f"a filter of {self.size} numbers ({self.n} states, {self.m} controls)"
         return module_of(source, label, N=self.n, M=self.m, W=self.n + self.m)
 
     @cached_property
-    def compiled_dynamics(self) -> DynamicsModel:
-        return dynamics_model(self.dynamics)
+    def predictor(self) -> Predictor:
+        places = self.dynamics.places
+        unknown = np.array([places[name] for name in self.parameters], dtype=np.float64)
+        lag, dynamics = np.array([self.lag.left, self.lag.mean]), dynamics_model(self.dynamics)
+        return Predictor(dynamics, self.plan.dt, unknown, lag, self.transition, self.output)
 
     @cached_property
     def compiled_sensor(self) -> SensorModel:
@@ -271,23 +229,14 @@ class PlanModel:
         measure, slope = module.addresses("measure", "measure_slope")
         return SensorModel(measure, slope, self.sensor.data)
 
-    @cached_property
-    def turning(self) -> AngularStates:
-        return turning_of(self.dynamics.state_coordinates)
-
-    @cached_property
-    def places(self) -> Array:
-        """Indices of the unknown parameters among the numbers."""
-        places = self.dynamics.places
-        return np.array([places[name] for name in self.parameters], dtype=np.float64)
+    # Along the plan.
 
     @cached_property
     def jacobian(self) -> Array:
         """[A B] of each step, (T, n, n + m)."""
         plan = self.plan
         following, jacobian = np.empty((plan.steps, self.n)), np.empty((plan.steps, self.n, self.n + self.m))
-        states, controls = in_c_order(plan.states), in_c_order(plan.controls)
-        dynamics = self.compiled_dynamics
+        states, controls, dynamics = in_c_order(plan.states), in_c_order(plan.controls), self.predictor.dynamics
         with self.dynamics.quiet():
             self.compiled.slopes_along(plan.steps, states, controls, dynamics, plan.dt, following, jacobian)
         return jacobian
@@ -302,10 +251,10 @@ class PlanModel:
             sizes = np.abs([self.dynamics.parameters[name] for name in self.parameters])
             most = np.where(sizes > 0, np.maximum(OF_SMALL * sizes, LEAST_STEP), np.inf)
             changes = np.minimum(STEP * np.maximum(sizes, 1.0), most)
-            states, controls = in_c_order(plan.states), in_c_order(plan.controls)
+            states, controls, model = in_c_order(plan.states), in_c_order(plan.controls), self.predictor
             with self.dynamics.quiet():
                 self.compiled.parameter_slopes(
-                    plan.steps, states, controls, self.compiled_dynamics, plan.dt, self.places, changes, slopes
+                    plan.steps, states, controls, model.dynamics, plan.dt, model.parameter_indices, changes, slopes
                 )
         return np.concatenate([slopes, B * plan.controls[:, None, :], B], axis=2)
 
@@ -314,27 +263,16 @@ class PlanModel:
         """Effect of the unknowns' states on the next state, (T, n, D)."""
         return self.effects @ self.output
 
-    @property
-    def F(self) -> Array:
-        return self._mean_step.F
-
-    @property
-    def G(self) -> Array:
-        return self._mean_step.G
-
-    @property
-    def c(self) -> Array:
-        return self._mean_step.c
-
     @cached_property
-    def _mean_step(self) -> Step:
+    def step(self) -> Step:
+        """The model, as a mean over commands that arrive and commands that get lost."""
         return self._step(self.lag)
 
     @cached_property
     def arriving(self) -> Step:
         """The model for a command that arrives. A lost one is as if the command had been the actuators' states."""
         lost = self.uncertainty.command_loss
-        return self._step(Lag.of(self.uncertainty.lag, self.plan.dt)) if lost else self._mean_step
+        return self._step(Lag.of(self.uncertainty.lag, self.plan.dt)) if lost else self.step
 
     def _step(self, lag: Lag) -> Step:
         n, a, steps = self.n, self.lagging, self.plan.steps
@@ -427,7 +365,7 @@ class PlanModel:
         commanded = self.arriving.G * per_entry("Uncertainty: control", self.uncertainty.control, controls)
         if self.uncertainty.lag == 0:
             commanded[:, n:first] = 0.0  # the command that stays in force after a loss has new noise
-        white = [unknown.std * self._column(unknown) for unknown in self.uncertainty.unknowns if unknown.white]
+        white = [unknown.std * self._weights(unknown) for unknown in self.uncertainty.unknowns if unknown.white]
         pushed = np.zeros((steps, self.size, len(white)))
         if white:
             pushed[:, :n] = self.effects @ np.array(white).T
@@ -444,14 +382,14 @@ class PlanModel:
         return varying @ varying.transpose(0, 2, 1) + constant @ constant.T
 
     @cached_property
-    def measurement_std(self) -> Array:
-        """Standard deviation of the noise on each measured state, (n,)."""
-        return per_entry("Uncertainty: measurement", self.uncertainty.measurement, self.dynamics.state_coordinates)
-
-    @cached_property
     def measurement_root(self) -> Array:
         """Square root of the covariance of v, (T+1, Y, n)."""
         return self.H * self.measurement_std
+
+
+def recursions() -> CompiledModule:
+    """`kernels/recursions.py`, compiled once for the filters, laws and moments of all sizes."""
+    return module_of(source_of(recursion_kernels), "filters, laws and moments along a plan")
 
 
 def _diagonal(blocks: list[Array]) -> Array:

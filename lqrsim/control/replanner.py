@@ -1,15 +1,14 @@
 """Re-planning: the rule that determines the problem, time and start of each solve; the log of the solves; and runs.
 
 `Replanner` is for simulations of many trials, `LiveReplanner` for a robot's own loop, with a thread. Within output
-feedback, `filter_law.py` applies the rule.
+feedback, `offset_free.py` applies the rule.
 """
 
 import math
-import queue
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Self
 
@@ -271,17 +270,6 @@ def within_rates(commands: Array, problem: Problem, sent: Array | None) -> Array
     return np.clip(commands, sent + low, sent + high)
 
 
-@dataclass(eq=False)
-class _Solve:
-    """A requested solve, and its answer as soon as there is one."""
-
-    request: SolveRequest
-    deadline: float  # on the clock
-    answer: Replan | None = None
-    error: Exception | None = None
-    missed: bool = False
-
-
 class LiveReplanner:
     """One run of a `Replanner` on a robot, made by `Replanner.live`: its own loop calls `step` as often as it likes.
 
@@ -306,22 +294,22 @@ class LiveReplanner:
         self.problem, self.active, self.log = rule.problem, ActivePlan(rule.solution, 0), ReplanLog()
         self._asked = -1  # the step at which a solve was last due
         self._step, self._command, self._sent = -1, None, None  # of the last call, and the command of a period before
-        self._solve: _Solve | None = None
-        self._queue: queue.SimpleQueue[_Solve | None] = queue.SimpleQueue()
-        self._thread: threading.Thread | None = None
+        self._solve: tuple[SolveRequest, Future[Replan]] | None = None
+        self._missed = False  # whether it was not done at its deadline
+        self._thread: ThreadPoolExecutor | None = None
+        self._begun = False
 
     def __enter__(self) -> Self:
-        if self._thread is not None:
+        if self._begun:
             raise InputError("LiveReplanner: got a second `with` on it, want a new replanner.live() for each run")
-        self._thread = threading.Thread(target=self._work, name="lqrsim re-planner", daemon=True)
-        self._thread.start()
+        self._thread, self._begun = ThreadPoolExecutor(1, thread_name_prefix="lqrsim re-planner"), True
         return self
 
     def __exit__(self, *exception: object) -> None:
         """End the thread, after its current solve."""
         if self._thread is not None:
-            self._queue.put(None)
-            self._thread.join()
+            self._thread.shutdown()
+            self._thread = None
 
     def summary(self) -> str:
         """The number of solves, their times, and why the previous law was kept, in a line."""
@@ -342,7 +330,7 @@ class LiveReplanner:
 
     def step(self, state: npt.ArrayLike, t: float) -> Array:
         """The control (m,) to apply in a measured state (n,), `t` seconds after the start."""
-        if self._thread is None or not self._thread.is_alive():
+        if self._thread is None:
             raise InputError("LiveReplanner: got a step without its thread, want `with replanner.live() as live:`")
         t = check_number("t", t, at_least=0.0)
         state = check_array("state", state, (len(self.active.plan.policy.state_coordinates),))
@@ -350,7 +338,7 @@ class LiveReplanner:
         step = int(min(t / dt, LONGEST) + 1e-9)
         self._adopt_answer(step)
         if self._solve is None and self._rule.due(step, self._asked):
-            self._ask(state, t, step)
+            self._ask(self._thread, state, t, step)
         policy = self.active.plan.policy
         command = policy(state, max(t - self.active.first * dt, 0.0), interpolate=self._interpolate)
         if step != self._step:
@@ -358,7 +346,7 @@ class LiveReplanner:
         self._command = within_rates(command, self.problem, self._sent)
         return self._command
 
-    def _ask(self, state: Array, t: float, step: int) -> None:
+    def _ask(self, thread: ThreadPoolExecutor, state: Array, t: float, step: int) -> None:
         """Begin a solve, of a state that is measured within a control period, unless that is in the funnel."""
         begun, dt = self._clock(), self.problem.dt
         late, self._asked = t - step * dt, step
@@ -366,31 +354,23 @@ class LiveReplanner:
             return
         problem = self._rule.problem_at(step, self.problem)
         request = self._rule.request(self.active, step, state, problem, late=late, sent=self._command)
-        solve = _Solve(request, begun + self._rule.delay * dt - late)
-        self._solve = solve
-        self._queue.put(solve)
+        deadline = begun + self._rule.delay * dt - late
+        answer = thread.submit(lambda: self._rule.solve(request, max(deadline - self._clock() - SPARE, 1e-6)))
+        self._solve, self._missed = (request, answer), False
 
     def _adopt_answer(self, step: int) -> None:
         """Put an answer into force at its deadline. A late answer is not used."""
-        solve = self._solve
-        if solve is None or step < solve.request.first:
+        if self._solve is None or step < self._solve[0].first:
             return
-        if solve.answer is None and solve.error is None:
-            solve.missed = True  # its thread continues until the solve is done, and the next solve waits for it
+        request, answer = self._solve
+        if not answer.done():
+            self._missed = True  # its thread continues until the solve is done, and the next solve waits for it
             return
         self._solve = None
-        if solve.answer is None:
-            self.log.kept[str(solve.error)] += 1
-        elif self.log.enter(solve.request.step, 0, solve.answer, late=solve.missed):
-            self.active = ActivePlan(solve.answer, solve.request.first)
-
-    def _work(self) -> None:
-        while (solve := self._queue.get()) is not None:
-            try:
-                left = solve.deadline - self._clock() - SPARE
-                solve.answer = self._rule.solve(solve.request, max(left, 1e-6))
-            except Exception as error:
-                solve.error = error
+        if error := answer.exception():
+            self.log.kept[str(error)] += 1
+        elif self.log.enter(request.step, 0, answer.result(), late=self._missed):
+            self.active = ActivePlan(answer.result(), request.first)
 
 
 MEASURED = "measured"

@@ -1,5 +1,19 @@
 """`track`, a policy that keeps a robot on a plan; and the choice of tolerances for `track` and `OffsetFree`.
 
+A tracking law is a further backward pass that minimises deviations from a plan instead of its cost. With z = (e, a, d)
+as in `plan_model.py` and u the deviation of the command, it minimises
+
+    sum_t  e' (Q + E_t) e + (u + M_t d)' R (u + M_t d)  +  e_T' (Q_T + E_T) e_T.
+
+E_t is the emphasis on deviations that lead to a collision; see `Surroundings.emphasis`. M_t d is the control that
+cancels the unknowns' effect on the next state as far as controls can. It costs nothing; otherwise a steady disturbance
+would leave a steady error. For the same reason a law assumes that the current disturbance continues: a law that expects
+a wind to abate yields to one that does not.
+
+If commands get lost, the law minimises the expected sum over the losses (Schenato 2009: LQG with a hold). When a
+command is lost, the previous one is held. It may be large, which makes the law gentle. The effort of a lost command
+does not count.
+
 The chosen tolerances have the smallest predicted chance of failure: of a collision, or of an end farther from the
 plan's end than the goal's radius. All of them follow from one number, the time in which a deviation should vanish: each
 state may deviate by as much as random controls of the tolerated effort move it in that time. Units therefore do not
@@ -17,30 +31,31 @@ If collisions are what makes a law fail, laws with an emphasis on the deviations
 
 import logging
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
 
-from lqrsim.control.collision_chance import Surroundings, collision_chance
-from lqrsim.control.controllers import Feedback
-from lqrsim.control.kalman import KalmanFilter
-from lqrsim.control.linear_loop import LinearLoop, moments_of
-from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.sampled_loop import DeviationNorm, sample_loop
-from lqrsim.control.tracking_laws import AT_END, Laws, Weights, check_plan, effort_of, tracking_laws
-from lqrsim.control.uncertainty import Uncertainty
+from lqrsim.annotations import Positive, checked
+from lqrsim.control.controllers import Feedback, check_plan
+from lqrsim.control.plan_model import PlanModel, recursions
+from lqrsim.control.prediction import DeviationNorm, LinearLoop, Surroundings, sample_loop
+from lqrsim.control.uncertainty import Uncertainty, per_entry
 from lqrsim.errors import Array, InputError, check_kind, check_number
-from lqrsim.kernels.records import LoopArrays, LoopMoments
+from lqrsim.kernels.records import LoopMoments, PassArrays, PassSizes, PassWork
+from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import PerEntry
-from lqrsim.results.goal import Target
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Trajectory
 from lqrsim.solvers.compiled import law_about, rollout
 
+CONTROL_SHARE = 0.25  # default of the largest change of a control, relative to the range between its limits
+# The tolerances of the position at the plan's end, relative to those before. Reaching a goal depends on the position
+# alone; controls that also bring the velocity to rest there have less effort left for it.
+AT_END = 0.1
 _log = logging.getLogger("lqrsim")
 PERIODS = (4, 6, 8, 10, 12, 14, 17, 20, 24, 29, 35, 42)  # numbers of control periods in which a deviation may decay
 WIDE = 10.0  # factor on the tolerances of states that the goal leaves free
@@ -64,6 +79,115 @@ TRIALS, LIMITED = 100, 1e-3
 OPEN = Surroundings((), (), (), 0.0)
 
 
+class Laws(NamedTuple):
+    """A law u = gain z + offset in deviations from a plan, or C laws to compare."""
+
+    gain: Array  # (T, m, Z), or (C, T, m, Z)
+    offset: Array  # (T, m), or (C, T, m)
+
+    def pick(self, i: int) -> "Laws":
+        """One of C."""
+        return Laws(self.gain[i], self.offset[i])
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """Weights of deviations from a plan: a deviation that is just tolerated costs 1."""
+
+    state: Array  # the diagonal of Q, (n,); or C diagonals to compare, (C, n)
+    control: Array  # the diagonal of R, (m,)
+    end: Array  # the diagonal of Q_T, (n,) or (C, n)
+    emphasis: Array | None = None  # E, further weights at each knot, (T+1, n, n) or (C, T+1, n, n); None for none
+
+    @classmethod
+    @checked
+    def of(cls, tolerate: PerEntry, effort: Array, dynamics: Dynamics, *, at_end: Positive = AT_END) -> "Weights":
+        """The weights for tolerances in the states' units and efforts (m,); `at_end` as in `track`."""
+        space = dynamics.state_coordinates
+        state = per_entry("tolerate", tolerate, space, above=0.0)
+        end, last = state.copy(), list(space.position) or slice(None)
+        end[last] *= at_end
+        return cls(state**-2.0, effort**-2.0, end**-2.0)
+
+    def pick(self, i: int | None) -> "Weights":
+        """One of C; with None, those of a single law as the only ones of C = 1."""
+        emphasis = None if self.emphasis is None else self.emphasis[i]
+        return Weights(self.state[i], self.control, self.end[i], emphasis)
+
+    def stressing(self, emphasis: Array, factors: tuple[float, ...]) -> "Weights":
+        """These with an emphasis (T+1, n, n) times each of C factors, as those of C laws to compare."""
+        many, factor = np.ones((len(factors), 1)), np.array(factors)[:, None, None, None]
+        return Weights(many * self.state, self.control, many * self.end, factor * emphasis)
+
+
+def effort_of(effort: PerEntry | None, dynamics: Dynamics) -> Array:
+    """Return the tolerated effort of each control, (m,); by default a fraction of its range."""
+    controls = dynamics.control_coordinates
+    if effort is not None:
+        return per_entry("effort", effort, controls, above=0.0)
+    ranges = np.subtract(controls.high, controls.low)
+    for name, size in zip(controls.labels, ranges, strict=True):
+        if not np.isfinite(size):
+            raise InputError(f"effort: got none, and {name} has no limits to derive it from, want effort= in its unit")
+    return CONTROL_SHARE * ranges
+
+
+def tracking_laws(model: PlanModel, weights: Weights, noise: Array | None = None, risk: float = 0.0) -> Laws:
+    """The law for these weights, or the laws for C of them.
+
+    With noise on the states, M (T, n, k), a law is averse to large deviations; the risk is theta, for half the sum that
+    it minimises. Raises LinAlgError if the risk is too high.
+
+    The cost-to-go 1/2 y' S y + y' (D d + s) of y = (e, a) is a quadratic of (y, d, 1, u) at the previous knot. The cost
+    of d alone does not change the law.
+    """
+    n, m, steps, lost = model.n, model.m, model.plan.steps, model.uncertainty.command_loss
+    movable, width = n + model.lagging, model.size + 1  # the states that controls can move, and numbers of (y, d, 1)
+    state, end = np.atleast_2d(weights.state), np.atleast_2d(weights.end)
+    # (y', d, 1) of (y, d, 1, u): the law assumes that d goes on as it is.
+    (F, G, c), forward = model.arriving, np.zeros((steps, width, width + m))
+    forward[:, :movable] = np.concatenate([F, c[:, :, None], G], axis=2)[:, :movable]
+    forward[:, range(movable, width), range(movable, width)] = 1.0
+    adjoint = np.concatenate([F[:, :movable, :movable], G[:, :movable]], axis=2).transpose(0, 2, 1)
+    held = np.zeros((steps, m, width))
+    if lost:  # a lost command is that in force, which is a
+        held[:, range(m), range(n, movable)], held[:, :, -1] = 1.0, model.reached[:-1] - model.plan.controls
+    compensation = np.zeros((steps, len(state), m, width))
+    # M_t, (C, T, m, D), by Q.
+    B = model.jacobian[:, :, n:]
+    weighed = B.transpose(0, 2, 1) * state[:, None, None, :]
+    curve = weighed @ B
+    efforts = np.sqrt(weights.control.min() / weights.control)  # the units in which all controls are alike
+    least = 1e-9 * np.vecdot(np.diagonal(curve, axis1=-2, axis2=-1), efforts**2) + 1e-300
+    cancelling = np.linalg.inv(curve + least[..., None, None] * np.diag(efforts**-2)) @ (weighed @ model.E)
+    compensation[..., movable:-1] = weights.control[:, None] * cancelling.swapaxes(0, 1)
+    cost, products = np.zeros((len(state), movable, width)), np.empty((len(state), movable + m, width + m))
+    cost[:, range(n), range(n)] = end
+    emphasis = None if weights.emphasis is None else weights.emphasis.reshape(len(state), steps + 1, n, n)
+    if emphasis is not None:
+        cost[:, :n, :n] += emphasis[:, steps]
+    stage = np.zeros((len(state), movable))
+    stage[:, :n] = state
+    sizes, laws = PassSizes(len(state), movable, model.size, m, lost), np.empty(compensation.shape)
+    arrays = PassArrays(weights.control, stage.ravel(), compensation.ravel(), held.ravel(), laws.ravel())
+    work = PassWork(cost.ravel(), products.ravel(), np.empty(len(state) * m * m), np.empty(m * width))
+    improve = recursions().lay_out("improve", 0, sizes, arrays, work)
+    for t in range(steps - 1, -1, -1):
+        if noise is not None:  # under the worst of it, the Hessian is S + S Y S, and the gradient s + S Y s
+            S, M = cost[0, :, :movable], np.zeros((movable, noise.shape[2]))
+            M[:n] = noise[t]
+            inner = np.eye(M.shape[1]) - risk * M.T @ S @ M
+            np.linalg.cholesky(inner)
+            spread = risk * S @ M @ np.linalg.solve(inner, M.T)
+            cost[0, :, :movable], cost[0, :, -1] = S + spread @ S, cost[0, :, -1] + spread @ cost[0, :, -1]
+        np.matmul(adjoint[t], cost @ forward[t], out=products)
+        improve(t, sizes, arrays, work)
+        if emphasis is not None:
+            cost[:, :n, :n] += emphasis[:, t]
+    chosen = Laws(laws.swapaxes(0, 1)[..., :-1], laws.swapaxes(0, 1)[..., -1])
+    return chosen if weights.state.ndim == 2 else chosen.pick(0)
+
+
 class Predictions(NamedTuple):
     """Predictions for laws: chance of failure, mean width of the tube, fraction of commands beyond the limits."""
 
@@ -71,26 +195,82 @@ class Predictions(NamedTuple):
     width: Array
     saturation: Array
 
-    @classmethod
-    def of(
-        cls, solution: Solution, surroundings: Surroundings, norm: DeviationNorm, moments: LoopMoments
-    ) -> "Predictions":
-        """The predictions for laws with these moments of the states, (..., T+1, n) and so on."""
-        mean, covariance = moments.mean, moments.covariance
-        collide = collision_chance(solution.trajectory.states + mean, covariance, moments.across, surroundings)[1]
-        squares = _squares(norm, covariance) + norm(mean) ** 2
-        width = np.sqrt(squares.mean(axis=-1))
-        miss = _chance_of_miss(mean[..., -1, :], covariance[..., -1, :, :], solution)
-        return cls(collide + miss, width, moments.saturation.mean(axis=(-2, -1)))
-
     def scores(self, least: float) -> Array:
         """What a choice of laws minimises: chance of failure, and terms for saturation and tubes wider than `least`."""
         return self.chance + FRAGILE * self.saturation**2 + NARROW * np.maximum(self.width / least, 1.0)
 
 
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """Judges laws about the plan of a solution by the moments of their states, (..., T+1, n) and so on."""
+
+    problem: Problem
+    solution: Solution
+    uncertainty: Uncertainty  # of the obstacles' positions
+
+    @cached_property
+    def surroundings(self) -> Surroundings:
+        return Surroundings.of(self.problem, self.uncertainty.obstacles)
+
+    @cached_property
+    def norm(self) -> DeviationNorm:
+        return DeviationNorm.of(self.solution, self.problem.dynamics.state_coordinates.position)
+
+    def predictions(self, moments: LoopMoments) -> Predictions:
+        mean, covariance, plan = moments.mean, moments.covariance, self.solution.trajectory
+        collide = self.surroundings.spread(plan.states + mean, covariance, moments.across).chance()[1]
+        width = np.sqrt((self.norm.squares(covariance) + self.norm(mean) ** 2).mean(axis=-1))
+        miss = self._chance_of_miss(mean[..., -1, :], covariance[..., -1, :, :])
+        return Predictions(collide + miss, width, moments.saturation.mean(axis=(-2, -1)))
+
+    def _chance_of_miss(self, mean: Array, covariance: Array) -> Array:
+        """About the chance to end farther from the plan's end than the goal's radius, by the moments there.
+
+        Of a position it is that of its most uncertain direction. Without one, each state that counts has its own bound.
+        """
+        target, radius = self.solution.target, self.solution.goal_radius
+        if place := target.places:
+            widest = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[..., place, :][..., place])[..., -1], 0.0))
+            off = np.linalg.norm(mean[..., place], axis=-1)
+            return np.zeros(off.shape) if radius is None else _chance_outside(radius, off, widest)
+        radius = target.radius(None, None, None) if radius is None else radius
+        counts, variance = np.isfinite(target.state), np.diagonal(covariance, axis1=-2, axis2=-1)
+        bounds, std = radius * target.scale, np.sqrt(np.maximum(variance, 0.0))
+        return 1 - np.prod(1 - _chance_outside(bounds, np.abs(mean), std)[..., counts], axis=-1)
+
+    def narrowest(self, widths: Array) -> float:
+        """The width of the narrowest tube; a thousandth of the plan's extent by the norm is narrow enough."""
+        extents = np.ptp(self.solution.trajectory.states[:, self.norm.states], axis=0) / self.norm.scale
+        return max(float(widths.min()), 1e-3 * (float(extents.max()) or 1.0))
+
+    def runs_lost(self, law: Laws, mean: Array, covariance: Array, farthest: float) -> int:
+        """The number of deviations, drawn from a tube, from which the nonlinear model does not return to its plan.
+
+        The law acts on the true state. The tube has these moments of the states, (T+1, n) and (T+1, n, n). A run that
+        gets farther from the plan than `farthest` is lost.
+        """
+        plan, n, rng, lost = self.solution.trajectory, mean.shape[1], np.random.default_rng(0), 0
+        gain, offset = law_about(plan.states, plan.controls + law.offset, law.gain[..., :n])
+        for t in (plan.steps * k // KNOTS for k in range(KNOTS)):
+            variances, axes = np.linalg.eigh(covariance[t])
+            off = rng.standard_normal((PAIRS, n)) * np.sqrt(np.maximum(variances, 0.0)) @ axes.T
+            for start in plan.states[t] + mean[t] + np.concatenate([off, -off]):
+                states, _ = rollout(self.problem, gain[t:], offset[t:], start)
+                with np.errstate(over="ignore", invalid="ignore"):  # of lost runs
+                    distance = self.norm(states - plan.states[t:])
+                lost += not (distance <= farthest).all()
+        return lost
+
+
+def _chance_outside(bound: Array | float, off: Array, std: Array) -> Array:
+    """The chance that normal numbers with these means exceed a bound in size."""
+    std = np.maximum(std, 1e-12)
+    return ndtr((off - bound) / std) + ndtr((-off - bound) / std)
+
+
 def choose_tolerances(
-    problem: Problem, solution: Solution, uncertainty: Uncertainty, model: PlanModel, effort: Array, at_end: float,
-    moments: Callable[[Laws], LoopMoments], truth: PlanModel | None = None, *, call: str,
+    judge: Judge, model: PlanModel, effort: Array, at_end: float, moments: Callable[[Laws], LoopMoments],
+    truth: PlanModel | None = None, *, call: str,
 ) -> tuple[Weights, Laws]:  # fmt: skip
     """Choose the tolerances whose law is predicted to fail least often, and that law.
 
@@ -99,25 +279,22 @@ def choose_tolerances(
       moments: predicts the states' moments under C laws.
       truth: model with the unknowns, for trials of laws that act on the measured state itself.
     """
-    norm = DeviationNorm.of(solution, problem.dynamics.state_coordinates.position)
-    surroundings = Surroundings.of(problem, uncertainty.obstacles)
-    tried = tolerances_to_try(model, effort, at_end, solution.target)
-    limits = solution.policy.control_coordinates.limits
+    tried = tolerances_to_try(model, effort, at_end, judge.solution)
     laws = tracking_laws(model, tried)
     loop_moments = moments(laws)
-    predicted = Predictions.of(solution, surroundings, norm, loop_moments)
-    least = narrowest(norm, model.plan, predicted.width)
+    predicted = judge.predictions(loop_moments)
+    least = judge.narrowest(predicted.width)
     scores = predicted.scores(least)
 
     def lost(moments: LoopMoments, laws: Laws, i: int) -> int:
         law = laws.pick(i)
         limited = moments.saturation[i].mean() > LIMITED
-        farthest = LOST * np.sqrt(_squares(norm, moments.covariance[i]).max())
-        count = runs_lost(problem, solution, law, moments.mean[i], moments.covariance[i], norm, farthest)
+        farthest = LOST * np.sqrt(judge.norm.squares(moments.covariance[i]).max())
+        count = judge.runs_lost(law, moments.mean[i], moments.covariance[i], farthest)
         if count or not limited or truth is None or not truth.uncertainty.unknowns:
             return count
-        run = Feedback(_policy_of(solution, law))
-        return int((sample_loop(truth, run, limits, OPEN, norm, TRIALS, 0).farthest > farthest).sum())
+        run, limits = Feedback(_policy_of(judge.solution, law)), judge.solution.policy.control_coordinates.limits
+        return int((sample_loop(truth, run, limits, OPEN, judge.norm, TRIALS, 0).farthest > farthest).sum())
 
     runs = dict[int, int]()  # the number of lost runs of each law
     for best in sorted(range(len(scores)), key=lambda i: (scores[i], -i)):  # of equals the gentlest first
@@ -136,19 +313,19 @@ def choose_tolerances(
     if predicted.saturation[best] > MODELLED:
         return chosen
     mean, covariance, across = loop_moments.mean[best], loop_moments.covariance[best], loop_moments.across[best]
-    emphasis = surroundings.emphasis(model.plan.states + mean, covariance, across, chosen[0].state)
+    emphasis = judge.surroundings.emphasis(model.plan.states + mean, covariance, across, chosen[0].state)
     if not emphasis.any():
         return chosen
     stressing = chosen[0].stressing(emphasis, EMPHASIS)
     laws = tracking_laws(model, stressing)
     loop_moments = moments(laws)
-    stressed = Predictions.of(solution, surroundings, norm, loop_moments).scores(least)
+    stressed = judge.predictions(loop_moments).scores(least)
     i = int(np.argmin(stressed))
     better = stressed[i] < scores[best] and lost(loop_moments, laws, i) <= runs[best]
     return (stressing.pick(i), laws.pick(i)) if better else chosen
 
 
-def tolerances_to_try(model: PlanModel, effort: Array, at_end: float, target: Target) -> Weights:
+def tolerances_to_try(model: PlanModel, effort: Array, at_end: float, solution: Solution) -> Weights:
     """Weights for each number of periods that a deviation may take to decay, the tightest first.
 
     If the goal leaves states free, the same with wide tolerances for these follow: a satellite that must take up an
@@ -157,88 +334,11 @@ def tolerances_to_try(model: PlanModel, effort: Array, at_end: float, target: Ta
     longest = max(model.plan.steps // 2, PERIODS[0])
     periods = [period for period in PERIODS if period <= longest]
     tried = list(model.reach(effort, periods))
-    if (free := np.isnan(target.state)).any():
+    if (free := np.isnan(solution.target.state)).any():
         tried += [np.where(free, WIDE * tolerances, tolerances) for tolerances in tried]
     choices = [Weights.of(tuple(tolerances.tolist()), effort, model.dynamics, at_end=at_end) for tolerances in tried]
     return Weights(
         np.array([choice.state for choice in choices]), choices[0].control, np.array([choice.end for choice in choices])
-    )
-
-
-def runs_lost(
-    problem: Problem, solution: Solution, law: Laws, mean: Array, covariance: Array, norm: DeviationNorm,
-    farthest: float,
-) -> int:  # fmt: skip
-    """The number of deviations, drawn from a tube, from which the nonlinear model does not return to its plan.
-
-    The law acts on the true state. The tube has these moments of the states, (T+1, n) and (T+1, n, n). A run that gets
-    farther from the plan than `farthest` is lost.
-    """
-    plan, n, rng, lost = solution.trajectory, mean.shape[1], np.random.default_rng(0), 0
-    gain, offset = law_about(plan.states, plan.controls + law.offset, law.gain[..., :n])
-    for t in (plan.steps * k // KNOTS for k in range(KNOTS)):
-        variances, axes = np.linalg.eigh(covariance[t])
-        off = rng.standard_normal((PAIRS, n)) * np.sqrt(np.maximum(variances, 0.0)) @ axes.T
-        for start in plan.states[t] + mean[t] + np.concatenate([off, -off]):
-            states, _ = rollout(problem, gain[t:], offset[t:], start)
-            with np.errstate(over="ignore", invalid="ignore"):  # of lost runs
-                distance = norm(states - plan.states[t:])
-            lost += not (distance <= farthest).all()
-    return lost
-
-
-def _squares(norm: DeviationNorm, covariance: Array) -> Array:
-    """The mean squared distance from the mean, by covariances (..., n, n)."""
-    return (np.diagonal(covariance, axis1=-2, axis2=-1)[..., norm.states] / norm.scale**2).sum(axis=-1)
-
-
-def narrowest(norm: DeviationNorm, plan: Trajectory, widths: Array) -> float:
-    """The width of the narrowest tube; a thousandth of the plan's extent by the norm is narrow enough."""
-    extent = float((np.ptp(plan.states[:, norm.states], axis=0) / norm.scale).max()) or 1.0
-    return max(float(widths.min()), 1e-3 * extent)
-
-
-def _chance_of_miss(mean: Array, covariance: Array, solution: Solution) -> Array:
-    """About the chance to end farther from the plan's end than the goal's radius, by the moments there.
-
-    Of a position it is that of its most uncertain direction. Without one, each state that counts has its own bound.
-    """
-    target, radius = solution.target, solution.goal_radius
-    if place := target.places:
-        widest = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[..., place, :][..., place])[..., -1], 0.0))
-        off = np.linalg.norm(mean[..., place], axis=-1)
-        return np.zeros(off.shape) if radius is None else _chance_outside(radius, off, widest)
-    radius = target.radius(None, None, None) if radius is None else radius
-    counts, variance = np.isfinite(target.state), np.diagonal(covariance, axis1=-2, axis2=-1)
-    bounds, std = radius * target.scale, np.sqrt(np.maximum(variance, 0.0))
-    return 1 - np.prod(1 - _chance_outside(bounds, np.abs(mean), std)[..., counts], axis=-1)
-
-
-def _chance_outside(bound: Array | float, off: Array, std: Array) -> Array:
-    """The chance that normal numbers with these means exceed a bound in size."""
-    std = np.maximum(std, 1e-12)
-    return ndtr((off - bound) / std) + ndtr((-off - bound) / std)
-
-
-def with_filter(model: PlanModel, kalman: KalmanFilter, limits: tuple[Array, Array], laws: Laws) -> LoopMoments:
-    """Moments of the states under C laws that follow a filter's estimates.
-
-    The filter is assumed to be right about the noise. Its error is then independent of its estimate, and what it learns
-    from a measurement is noise that moves the estimate. The unknowns' estimates are moved by no law.
-    """
-    n, size = model.n, model.n + model.lagging
-    learned = kalman.gain @ kalman.innovation @ kalman.gain.transpose(0, 2, 1)
-    F, G, c, noise = (array[:, None, :size] for array in (model.F, model.G, model.c, learned))
-    gain, offset = (part.swapaxes(0, 1) for part in laws)
-    planned = model.plan.controls
-    arrays = LoopArrays(
-        F, G.swapaxes(-1, -2), c, noise, learned[:, size:, size:], model.transition, gain, planned[:, None] + offset,
-        planned, np.zeros((*offset.shape, model.m)), np.zeros(0), model.reached, *limits,
-    )  # fmt: skip
-    moments = LoopMoments(*(moment[0] for moment in moments_of(arrays, size, n)))
-    return moments._replace(
-        covariance=moments.covariance + kalman.corrected[:, :n, :n],
-        across=moments.across + model.F[:, :n] @ kalman.corrected[:-1, :, :n],
     )
 
 
@@ -280,22 +380,21 @@ def track(
     kinds, wanted = (Uncertainty, type(None)), "an Uncertainty, such as uncertainty_of(...)"
     check_kind("track: uncertainty", uncertainty, kinds, wanted)
     command_loss = 0.0 if uncertainty is None else uncertainty.command_loss
-    model = PlanModel.of(dynamics, plan, Uncertainty(command_loss=command_loss))
+    model = PlanModel(dynamics, plan, Uncertainty(command_loss=command_loss))
     efforts = effort_of(effort, dynamics)
     if tolerate is not None:
         law = _law(problem, solution, model, Weights.of(tolerate, efforts, dynamics, at_end=at_end), risk)
     elif uncertainty is None:
         raise InputError("track: tolerate: got none, want deviations, such as {'m': 0.05, 'm/s': 0.2}, or uncertainty=")
     else:
-        truth = PlanModel.of(dynamics, plan, uncertainty)
+        truth = PlanModel(dynamics, plan, uncertainty)
 
         def moments(laws: Laws) -> LoopMoments:
             limits = solution.policy.control_coordinates.limits
             return LinearLoop(truth, laws.gain[..., : model.n], laws.offset, None, limits).moments(model.n)
 
-        _, law = choose_tolerances(
-            problem, solution, uncertainty, model, efforts, at_end, moments, truth, call="track(...)"
-        )
+        judge = Judge(problem, solution, uncertainty)
+        _, law = choose_tolerances(judge, model, efforts, at_end, moments, truth, call="track(...)")
     return _policy_of(solution, law)
 
 

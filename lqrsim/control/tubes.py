@@ -1,9 +1,9 @@
 """Tubes: the covariance of a closed loop's deviation from its plan, and its chance of collision.
 
 LQG-MP (van den Berg, Abbeel and Goldberg 2011): with the linear model about the plan, the true state and the estimate
-are jointly Gaussian, and their distribution is known before any run; `linear_loop.py` has the recursion. The chance of
-collision follows from these moments, unless trials of the nonlinear model refute it; see `sampled_loop.py`. In belief
-space the filter is part of the plan, and its moments are the tube's.
+are jointly Gaussian, and their distribution is known before any run. The chance of collision follows from these
+moments, unless trials of the nonlinear model refute it; `prediction.py` has both. In belief space the filter is part of
+the plan, and its moments are the tube's.
 """
 
 from dataclasses import dataclass, replace
@@ -14,14 +14,10 @@ import numpy as np
 from scipy.special import ndtr
 
 from lqrsim.annotations import Share, checked, repr_of
-from lqrsim.control.belief_feedback import BeliefFeedback
-from lqrsim.control.collision_chance import Surroundings, collision_chance
-from lqrsim.control.controllers import ControllerLike, Feedback
-from lqrsim.control.linear_loop import LinearLoop
+from lqrsim.control.controllers import BeliefFeedback, ControllerLike, Feedback, check_plan
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.sampled_loop import DeviationNorm, sample_loop
-from lqrsim.control.tracking_laws import check_plan
+from lqrsim.control.prediction import DeviationNorm, LinearLoop, Surroundings, sample_loop
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_count, check_kind, check_seed
 from lqrsim.problem.belief import Belief
@@ -133,7 +129,7 @@ def predict_tube(
     else:
         chosen: object = solution.policy if controller is None else controller
         policy = check_kind("predict_tube: controller", chosen, AffinePolicy, "an OffsetFree or an AffinePolicy")
-        model = PlanModel.of(problem.dynamics, plan, uncertainty)
+        model = PlanModel(problem.dynamics, plan, uncertainty)
         at_plan = policy.state_coordinates.nearest(plan.states[:-1], policy.nominal)
         offset = np.einsum("tij,tj->ti", policy.gain, at_plan) + policy.offset - plan.controls
         loop = LinearLoop(model, policy.gain, offset, None, policy.control_coordinates.limits)
@@ -158,7 +154,7 @@ def predict_tube(
         both = joint[:, :n, guess]
         estimate = joint[:, :n, :n] + joint[:, guess, guess] - both - both.transpose(0, 2, 1)
     mean, covariance, across = moments.mean[:, :n], moments.covariance[:, :n, :n], moments.across[:, :n, :n]
-    chance, linear = collision_chance(plan.states + mean, covariance, across, surroundings)
+    chance, linear = surroundings.spread(plan.states + mean, covariance, across).chance()
     strays = None
     if trials is not None:
         scaled = covariance[:, norm.states][:, :, norm.states] / np.outer(norm.scale, norm.scale)
@@ -192,7 +188,7 @@ def _tube_of_belief(belief: Belief, problem: Problem, solution: Solution) -> Tub
     command = np.sqrt(np.vecdot(policy.gain @ strayed[:-1], policy.gain))
     space, scale = policy.control_coordinates, np.maximum(command, 1e-12)
     saturation = ndtr((space.low - plan.controls) / scale) + ndtr((plan.controls - space.high) / scale)
-    chance, linear = collision_chance(plan.states, covariance, across, Surroundings.of(problem, 0.0))
+    chance, linear = Surroundings.of(problem, 0.0).spread(plan.states, covariance, across).chance()
     return Tube(
         plan=Trajectory(plan.states[:, :n], plan.controls, plan.dt), state_coordinates=belief.robot.state_coordinates,
         mean=np.zeros((plan.steps + 1, n)), covariance=covariance, across=across,

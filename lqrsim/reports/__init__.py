@@ -22,7 +22,7 @@ from lqrsim.results.archive import write_text
 from lqrsim.results.goal import OUTCOMES, Target, tracking_unit
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.simulation.uncertainty_of import uncertainty_of
+from lqrsim.simulation.effects import uncertainty_of
 from lqrsim.stress import analysis
 from lqrsim.stress.policies import DESIGNED, design_disturbances
 from lqrsim.stress.results import Results, replay

@@ -1,7 +1,7 @@
 """The base class for simulators other than MuJoCo.
 
 The scene is still MuJoCo's: obstacles, distances to them and pictures come from its MJCF. A robot that another
-simulator moves passes through obstacles. Its first collision is found from its states, as in `collisions.py`.
+simulator moves passes through obstacles. Its first collision is found from its states; see `Collisions`.
 """
 
 import abc

@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lqrsim.control.belief_feedback import BeliefFeedback
-from lqrsim.control.controllers import Controller
+from lqrsim.control.controllers import BeliefFeedback, Controller
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.replanner import Replanner
 from lqrsim.control.tracking import track
@@ -21,7 +20,7 @@ from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import disturbance_set
 from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.simulation.uncertainty_of import uncertainty_of
+from lqrsim.simulation.effects import uncertainty_of
 
 _log = logging.getLogger("lqrsim")
 

@@ -26,8 +26,8 @@ from scipy.special import ndtri
 
 from lqrsim.annotations import Bounds, Chance, Count, Line, Seed, TextProgress, Want, checked
 from lqrsim.control.chance_constrained import smooth_chance_constrained
-from lqrsim.control.collision_chance import Surroundings
 from lqrsim.control.offset_free import OffsetFree
+from lqrsim.control.prediction import Surroundings
 from lqrsim.control.tubes import STRAY, predict_tube
 from lqrsim.errors import Array, InputError, check_array, check_name, check_path, keep
 from lqrsim.problem.noise import Noise
@@ -39,8 +39,8 @@ from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance
+from lqrsim.simulation.effects import uncertainty_of
 from lqrsim.simulation.plant import Plant
-from lqrsim.simulation.uncertainty_of import uncertainty_of
 from lqrsim.solvers.compiled import costs_of
 from lqrsim.solvers.smoother import smooth
 from lqrsim.stress.failure_search import RareFailures, ReliabilityProblem, Report, write_json

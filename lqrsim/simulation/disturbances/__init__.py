@@ -10,15 +10,17 @@ import numpy as np
 
 from lqrsim.annotations import checked
 from lqrsim.errors import InputError, check_name
-from lqrsim.simulation.disturbances.actuation import ActuatorLoss, MotorLag, Saturation
-from lqrsim.simulation.disturbances.base import Disturbance, Effect, GaussianDisturbance
-from lqrsim.simulation.disturbances.links import (
+from lqrsim.simulation.disturbances.actuation import (
+    ActuatorLoss,
     CommandDropouts,
     ControlDelay,
     GilbertElliott,
     MeasurementDropouts,
     MeasurementLatency,
+    MotorLag,
+    Saturation,
 )
+from lqrsim.simulation.disturbances.base import Disturbance, Effect, GaussianDisturbance
 from lqrsim.simulation.disturbances.mismatch import (
     AxleMismatch,
     FrictionMismatch,
@@ -37,10 +39,10 @@ from lqrsim.simulation.disturbances.noise import (
     MeasurementBias,
     MeasurementNoise,
     Push,
+    SensorErrors,
     TorqueNoise,
 )
 from lqrsim.simulation.disturbances.noise import as_disturbances as as_disturbances
-from lqrsim.simulation.disturbances.sensors import SensorErrors
 from lqrsim.simulation.disturbances.wind import Dryden, Gusts, MeanWind
 from lqrsim.simulation.plant import Plant
 
