@@ -99,7 +99,7 @@ def test_accuracy_takes_as_many_substeps_as_it_needs() -> None:
     np.testing.assert_allclose(again.trajectory.states, plan.states, atol=1e-6)
 
 
-@pytest.mark.parametrize("steps", [16, 20, 40])
+@pytest.mark.parametrize("steps", [16, 40, *rarely(20)])
 def test_a_plan_of_many_substeps_is_looked_at_with_them(steps: int) -> None:
     """With one step in a period of many vibrations nothing of the motion is seen, and the plan was called coarse."""
     found = ls.smooth(rattled(steps=steps))
@@ -141,7 +141,8 @@ def test_what_is_kept_between_knots_is_kept_in_continuous_time(number: int) -> N
     assert "between_knots=True)" not in str(kept)  # the steps may be off: no accuracy is asked for
 
 
-@pytest.mark.parametrize("number", [1, 2, 3])
+# A drive, with a fixed duration and with free ones: what is compiled for the others takes seconds.
+@pytest.mark.parametrize("number", [1, 4, 49, *rarely(2, 3)])
 @pytest.mark.parametrize("begin", [-2.0, 5.0])
 def test_times_between_knots_are_those_of_the_plan(number: int, begin: float) -> None:
     """As those of knots: from the plan's first one, whenever it begins."""
