@@ -1,6 +1,7 @@
+import gc
 import logging
 import signal
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,17 @@ def pytest_configure(config: pytest.Config) -> None:
         files = sorted(str(path) for path in TESTS.glob("test_*.py"))
         first = len(files) * int(asked["workerid"].removeprefix("gw")) // asked["workercount"]
         config.args[:] = files[first:] + files[:first]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """What is collected stays until the end: the garbage collector would look through it again and again."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def is_short(config: pytest.Config) -> bool:
