@@ -20,10 +20,17 @@ DOCS = Path(__file__).parent.parent / "docs"
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
-def run_page(name: str) -> dict[str, Any]:
-    """Run the Python blocks of a page, in order, in one namespace; tracebacks have the page's line numbers."""
+def run_page(name: str, **shorter: str) -> dict[str, Any]:
+    """Run the Python blocks of a page, in order, in one namespace; tracebacks have the page's line numbers.
+
+    Args:
+      shorter: what stands in place of arguments of calls, such as "steps=50", by their names.
+    """
     page = DOCS / name
     text = page.read_text(encoding="utf-8")
+    for argument, new in shorter.items():
+        text, count = re.subn(rf"\b{argument}=[\w.]+", f"{argument}={new}", text)
+        assert count
     namespace: dict[str, Any] = {"__name__": page.stem}
     for block in BLOCK.finditer(text):
         line = text.count("\n", 0, block.start(1))
@@ -73,7 +80,7 @@ def test_a_robot_from_a_urdf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 def test_fitting_to_data_as_on_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("tabulate", reason="needs the `sysid` extra")
     monkeypatch.chdir(tmp_path)
-    names = run_page("mjcf_robots.md")
+    names = run_page("mjcf_robots.md", max_iterations="1")  # of a hop, of which the page prints how far it has come
     (block,) = blocks_for_an_extra("mjcf_robots.md", "sysid")
     exec(compile(block, "mjcf_robots.md", "exec"), names)
     fitted = {name: one.value[0] for name, one in names["fitted"].items()}
