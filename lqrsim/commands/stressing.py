@@ -1,20 +1,17 @@
 """Commands that measure how policies fail: stress tests, rare failures, the smallest failure, and funnels."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from tyro.conf import Positional, Suppress, arg
 
 import lqrsim as ls
 from lqrsim.commands import console
 from lqrsim.commands.options import DesignSet, Folder, Json, SolutionFile, optional, options_of, refuse, stated
-
-if TYPE_CHECKING:
-    from lqrsim.results.certified import Funnel
-    from lqrsim.stress.failure_search import RareFailures, SmallestFailure
-    from lqrsim.stress.safer_plans import HardenedPlan
 
 PolicyName = Literal["smooth", "ilqr", "open_loop", "replan", "track", "offset_free"]
 CampaignPolicyName = Literal[PolicyName, "track_per_cell", "offset_free_per_cell"]
@@ -252,7 +249,8 @@ class FailureOptions(StudyOptions):
 
         try:
             with console.keeping(write), console.Progress(*self.SEARCH) as progress:
-                result = self._search(problem, report=console.say, progress=progress)
+                search = self._search(problem)
+                result = search(**stated(self, search, report=console.say, progress=progress))
         except ls.stress.NoFailure as none:
             return _say_none(none)
         return write(result)
@@ -260,8 +258,8 @@ class FailureOptions(StudyOptions):
     SEARCH: ClassVar[tuple[str, str]]  # what the command does, and in which units, for its progress
     FILES: ClassVar[tuple[str, ...]]  # what it writes; without failures the first two
 
-    def _search(self, problem: "ls.stress.ReliabilityProblem", **callbacks: Any) -> Any:
-        """The result of the search, with these callbacks."""
+    def _search(self, problem: "ls.stress.ReliabilityProblem") -> Callable[..., Any]:
+        """The function that searches, of the command's options and of callbacks."""
         raise NotImplementedError
 
     def _words(self, result: Any) -> str:
@@ -288,10 +286,10 @@ class Rare(FailureOptions):
     SEARCH = "splitting", "repetition"
     FILES = "rollout.npz", "rare.json", "certificate.npz"
 
-    def _search(self, problem: "ls.stress.ReliabilityProblem", **callbacks: Any) -> "RareFailures":
-        return problem.rare_failures(**stated(self, problem.rare_failures, **callbacks))
+    def _search(self, problem: "ls.stress.ReliabilityProblem") -> Callable[..., Any]:
+        return problem.rare_failures
 
-    def _words(self, result: "RareFailures") -> str:
+    def _words(self, result: Any) -> str:
         failures = len(result.splitting.failures)
         others = min(failures, self.shown) - 1
         return f"{result.summary()}\nthe worst of {failures:,} failures, as trial 0, and {others} others:"
@@ -313,8 +311,8 @@ class Break(FailureOptions):
     SEARCH = "searching", "round"
     FILES = "rollout.npz", "break.json"
 
-    def _search(self, problem: "ls.stress.ReliabilityProblem", **callbacks: Any) -> "SmallestFailure":
-        return problem.smallest_failure(**stated(self, problem.smallest_failure, **callbacks))
+    def _search(self, problem: "ls.stress.ReliabilityProblem") -> Callable[..., Any]:
+        return problem.smallest_failure
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -342,10 +340,10 @@ class Harden(FailureOptions):
     SEARCH = "hardening", "repetition"
     FILES = "solution.npz", "harden.json", "rollout.npz", "rare.json", "certificate.npz"
 
-    def _search(self, problem: "ls.stress.ReliabilityProblem", **callbacks: Any) -> "HardenedPlan":
-        return ls.stress.harden(problem, **stated(self, ls.stress.harden, **callbacks))
+    def _search(self, problem: "ls.stress.ReliabilityProblem") -> Callable[..., Any]:
+        return partial(ls.stress.harden, problem)
 
-    def _words(self, result: "HardenedPlan") -> str:
+    def _words(self, result: Any) -> str:
         return result.verdict()
 
 
@@ -433,7 +431,7 @@ class FunnelCommand(StudyOptions):
                 disturbances.append(disturbance.scaled(self.strength))
         options = stated(self, ls.funnel, **study.closed_loop, disturbances=disturbances)
 
-        def write(result: "Funnel") -> int:
+        def write(result: "ls.types.Funnel") -> int:
             console.say(result.summary())
             console.result(funnel=console.of_funnel(result))
             console.save(result, folder / "funnel.npz")
