@@ -6,7 +6,7 @@ Rerun. Tubes are of ellipsoids along a plan, which figures have, too.
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -127,9 +127,9 @@ class Shape(NamedTuple):
     """A geom of MuJoCo's as it is drawn in addition to the model's, without shadow and gloss."""
 
     kind: Geom
-    size: npt.ArrayLike  # (3,)
-    place: npt.ArrayLike  # (3,)
-    rgba: npt.ArrayLike
+    size: Any  # (3,) numbers, as its place
+    place: Any
+    rgba: Any
     rotation: Array = np.eye(3)
 
     def set(self, geom: mujoco.MjvGeom, *, emission: float = 0.0) -> mujoco.MjvGeom:
