@@ -34,8 +34,8 @@ import lqrsim as ls
 from lqrsim.control.controllers import ControllerLike
 from lqrsim.disturbances import ControlDelay, Disturbance, Effect
 from lqrsim.errors import Array
-from lqrsim.problem.costs import CostTerm
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.parts import CostTerm
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.simulation.disturbances.wind import first_order
 from lqrsim.simulators import RotorPy

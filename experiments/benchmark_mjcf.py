@@ -31,7 +31,7 @@ from runner import Result, Settings, at_most, opening, progress, run, table
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.problem.costs import terms_of
+from lqrsim.problem.parts import terms_of
 from lqrsim.scenes.scene import scene_from_xml
 
 WIDE = 1e-6  # of the central differences: wider ones would often reach across a kink, as of a clamped force

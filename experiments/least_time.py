@@ -19,8 +19,8 @@ from paper.common import figure
 from runner import FolderSettings, Result, opening, progress, run, table
 
 import lqrsim as ls
-from lqrsim.problem.costs import CostSum
 from lqrsim.problem.obstacles import ObstacleCost
+from lqrsim.problem.parts import CostSum
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,7 +24,7 @@ from solver_benchmark.scaling import chain_of_masses
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.problem.costs import CostSum, terms_of
+from lqrsim.problem.parts import CostSum, terms_of
 from lqrsim.view.style import LIMIT, PLAN, RUNS, plain_decades
 
 ROBOTS = ("drive", "quadrotor")

@@ -18,9 +18,7 @@ from .control.tracking import track as track
 from .control.tubes import predict_tube as predict_tube
 from .errors import InputError as InputError
 from .problem.collision_shape import CollisionSpheres as CollisionSpheres
-from .problem.constraints import Constraint as Constraint
 from .problem.control_rate import ControlRate as ControlRate
-from .problem.costs import Cost as Cost
 from .problem.derivative_check import check_derivatives as check_derivatives
 from .problem.dynamics import Dynamics as Dynamics
 from .problem.formulas import FunctionCost as FunctionCost
@@ -29,6 +27,8 @@ from .problem.formulas import SymbolicCost as SymbolicCost
 from .problem.noise import Noise as Noise
 from .problem.obstacles import Clearance as Clearance
 from .problem.obstacles import ObstacleCost as ObstacleCost
+from .problem.parts import Constraint as Constraint
+from .problem.parts import Cost as Cost
 from .problem.problem import FixedState as FixedState
 from .problem.problem import Problem as Problem
 from .problem.quadratic_cost import ControlCost as ControlCost

@@ -7,9 +7,8 @@ from lqrsim.control.replanner import LiveReplanner, ReplanRecord
 from lqrsim.control.tubes import Tube
 from lqrsim.outlines import Box, Capsule
 from lqrsim.problem.collision_shape import SphereCenters
-from lqrsim.problem.constraints import ConstraintTerm
-from lqrsim.problem.costs import CostTerm
 from lqrsim.problem.derivative_check import DerivativeCheck
+from lqrsim.problem.parts import ConstraintTerm, CostTerm
 from lqrsim.results.certified import Funnel
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.display import DataTable

@@ -58,8 +58,7 @@ FLOORS_WITHIN = {
     ),
     "problem": (
         ("dynamics",),
-        ("costs", "noise"),
-        ("constraints",),
+        ("noise", "parts"),
         ("mjcf_dynamics",),
         ("collision_shape",),
         ("control_rate", "formulas", "obstacles", "quadratic_cost", "sites", "state_bounds"),

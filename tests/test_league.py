@@ -21,7 +21,7 @@ from sampling import rarely
 from scipy.optimize import lsq_linear
 
 import lqrsim as ls
-from lqrsim.problem.costs import terms_of
+from lqrsim.problem.parts import terms_of
 
 SCRIPT = Path(__file__).parent.parent / "experiments" / "solver_league.py"
 

@@ -25,7 +25,7 @@ import lqrsim as ls
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import mjcf_dynamics as kernel
 from lqrsim.machine import processors
-from lqrsim.problem.costs import terms_of
+from lqrsim.problem.parts import terms_of
 from lqrsim.problem.state_bounds import LimitCost
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers.compiled import costs_of

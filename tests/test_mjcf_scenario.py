@@ -11,7 +11,7 @@ from mechanisms import sled
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.errors import InputError
-from lqrsim.problem.costs import terms_of
+from lqrsim.problem.parts import terms_of
 from lqrsim.problem.state_bounds import LimitCost
 from lqrsim.scenarios.references import from_anywhere, names_code, resolve
 

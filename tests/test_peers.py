@@ -16,7 +16,7 @@ import lqrsim as ls
 from lqrsim.errors import Array
 from lqrsim.kernels.declarations import ROW
 from lqrsim.kernels.distances import signed_distance_derivatives
-from lqrsim.problem.costs import terms_of
+from lqrsim.problem.parts import terms_of
 
 ROBOTS = ("differential_drive", "quadrotor")
 

@@ -14,7 +14,7 @@ from sampling import examples
 import lqrsim as ls
 from lqrsim.errors import check_symmetric
 from lqrsim.problem.control_rate import with_last_command
-from lqrsim.problem.costs import CostSum
+from lqrsim.problem.parts import CostSum
 from lqrsim.solvers import compiled
 
 

@@ -64,7 +64,7 @@ def wait_for(found: Path, pattern: str, process: subprocess.Popen[str]) -> None:
         ("tyro", signal.SIGINT), ("mujoco", signal.SIGTERM),
         *rarely(
             ("tyro", signal.SIGTERM), ("mujoco", signal.SIGINT), ("numpy", signal.SIGINT),
-            ("lqrsim.problem.costs", signal.SIGTERM),
+            ("lqrsim.problem.parts", signal.SIGTERM),
         ),
     ],
 )  # fmt: skip

@@ -42,7 +42,7 @@ from lqrsim.errors import (
     excerpt,
 )
 from lqrsim.machine import memory
-from lqrsim.problem.costs import CostTerm
+from lqrsim.problem.parts import CostTerm
 from lqrsim.results.solution_parts import BetweenKnots
 from lqrsim.simulation.effects import tube_under
 from lqrsim.stress import Campaign

@@ -20,7 +20,7 @@ from scipy.linalg import solve_banded
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.problem.costs import Cost, terms_of
+from lqrsim.problem.parts import Cost, terms_of
 
 Values = Any  # an array of real or complex numbers
 Rate = Callable[[list[Values], list[Values], Any], list[Any]]

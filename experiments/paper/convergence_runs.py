@@ -6,7 +6,7 @@ import numpy as np
 from peers import truth
 
 import lqrsim as ls
-from lqrsim.problem.costs import CostSum, terms_of
+from lqrsim.problem.parts import CostSum, terms_of
 from paper.common import as_in_the_paper
 from paper.curvature import discarded
 

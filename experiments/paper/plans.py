@@ -9,7 +9,7 @@ from runner import Result, counting
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.problem.costs import terms_of
+from lqrsim.problem.parts import terms_of
 from paper.common import as_in_the_paper, numbers
 from paper.homotopy import Way, way
 

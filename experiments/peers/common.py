@@ -19,7 +19,7 @@ import lqrsim as ls
 from lqrsim.codegen import disk_cache as disk
 from lqrsim.errors import Array
 from lqrsim.machine import versions_of
-from lqrsim.problem.costs import terms_of
+from lqrsim.problem.parts import terms_of
 
 # Rounding as in lqrsim's compiled functions: sums may be reordered, NaN and infinity stay meaningful.
 FLAGS = (

@@ -15,8 +15,7 @@ import numpy as np
 import lqrsim as ls
 from lqrsim.codegen.symbolic import Vector
 from lqrsim.errors import Array
-from lqrsim.problem.constraints import goals_of
-from lqrsim.problem.costs import Cost, terms_of
+from lqrsim.problem.parts import Cost, goals_of, terms_of
 from peers.common import casadi
 
 

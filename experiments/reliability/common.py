@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 import lqrsim as ls
 from lqrsim.errors import check_name
-from lqrsim.problem.costs import terms_of
+from lqrsim.problem.parts import terms_of
 from reliability.problems import KINDS
 
 Section = Literal["stiff", "fragile", "random", "overhead", "ablation"]

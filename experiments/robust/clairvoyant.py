@@ -22,7 +22,7 @@ from lqrsim import rotations
 from lqrsim.control.controllers import Controller, ControllerRun
 from lqrsim.disturbances import CommandDropouts, ControlNoise, Disturbance, MotorLag
 from lqrsim.errors import Array
-from lqrsim.problem.costs import terms_of
+from lqrsim.problem.parts import terms_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.simulation.effects import seeded

@@ -21,7 +21,7 @@ from lqrsim.control.prediction import LARGEST_MARGIN, Spread, Surroundings
 from lqrsim.control.tubes import Tube, predict_tube
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import InputError
-from lqrsim.problem.costs import weighing_obstacles
+from lqrsim.problem.parts import weighing_obstacles
 from lqrsim.problem.problem import Problem
 from lqrsim.process import keeping
 from lqrsim.results.policy import AffinePolicy

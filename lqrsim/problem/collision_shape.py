@@ -42,9 +42,9 @@ from lqrsim.errors import (
 from lqrsim.kernels import differences, distances, mjcf_dynamics, user_functions
 from lqrsim.kernels.distances import MOST_CORNERS
 from lqrsim.outlines import Capsule
-from lqrsim.problem.costs import Residual
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.mjcf_dynamics import MjcfDynamics, MjcfMemory
+from lqrsim.problem.parts import Residual
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.scenes.mujoco_log import mujoco
 from lqrsim.scenes.scene import Pairs, Scene, pairs_of, solid_geoms

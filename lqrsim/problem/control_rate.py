@@ -17,9 +17,8 @@ from lqrsim.codegen import user_functions
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.errors import Array, InputError, brief, check_array, check_items, free_name, keep, numbers_of
 from lqrsim.kernels.declarations import M, N, W, at, call, stack, zeros
-from lqrsim.problem.constraints import Constraint, ConstraintTerm, bind_all
-from lqrsim.problem.costs import Cost, CostTerm, ProblemPart, terms_of
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.parts import Constraint, ConstraintTerm, Cost, CostTerm, ProblemPart, bind_all, terms_of
 from lqrsim.problem.quadratic_cost import QuadraticCost
 from lqrsim.results.coordinates import Coordinates, PerEntry
 

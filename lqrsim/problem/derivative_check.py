@@ -10,9 +10,8 @@ import numpy as np
 from lqrsim.annotations import Bounds, Line, NonNegative, Positive, Seed, checked
 from lqrsim.codegen.user_functions import Term, UserFunction, first_numbers
 from lqrsim.errors import Array, InputError
-from lqrsim.problem.constraints import PlainTerm
-from lqrsim.problem.costs import CostTerm, terms_of
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.parts import CostTerm, PlainTerm, terms_of
 from lqrsim.problem.problem import FixedState, Problem
 
 STEP = 6e-6  # step of difference quotients, relative to numbers above 1

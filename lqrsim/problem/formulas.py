@@ -28,9 +28,8 @@ from lqrsim.codegen.user_functions import (
 from lqrsim.errors import Array, InputError, check_kind, check_name, check_shape, check_text, excerpt, numbers_of
 from lqrsim.kernels import differences, user_functions
 from lqrsim.kernels.declarations import constraint_slope, constraint_value, stack
-from lqrsim.problem.constraints import STEPS, Constraint, ConstraintTerm
-from lqrsim.problem.costs import Cost, CostTerm
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.parts import STEPS, Constraint, ConstraintTerm, Cost, CostTerm
 
 WANTED = "one of SymPy symbols"  # for a numba function in place of a formula
 MOST_LETTERS = 60  # of an expression that stands for a name: half a line

@@ -30,8 +30,8 @@ from lqrsim.errors import Array, InputError, check_name, check_number
 from lqrsim.kernels import mjcf_dynamics as kernel
 from lqrsim.kernels.declarations import M, N, W
 from lqrsim.machine import processors
-from lqrsim.problem.constraints import Constraint, ConstraintTerm
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.parts import Constraint, ConstraintTerm
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.solution_parts import Trajectory

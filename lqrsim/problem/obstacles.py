@@ -1,7 +1,4 @@
-"""What keeps a robot clear: a cost and a constraint on obstacles, a constraint on its own links; and the kernels.
-
-`costs.py` and `constraints.py` say what a cost and a constraint are.
-"""
+"""What keeps a robot clear: a cost and a constraint on obstacles, a constraint on its own links; and the kernels."""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
@@ -25,10 +22,9 @@ from lqrsim.problem.collision_shape import (
     ShapeInWorld,
     shape_in,
 )
-from lqrsim.problem.constraints import Constraint, ConstraintTerm
-from lqrsim.problem.costs import Cost, CostTerm
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.mjcf_dynamics import MjcfDynamics
+from lqrsim.problem.parts import Constraint, ConstraintTerm, Cost, CostTerm
 from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.scene import link_pairs
 from lqrsim.scenes.world import World

@@ -24,21 +24,25 @@ from lqrsim.errors import (
     renamed,
     shaped,
 )
-from lqrsim.problem.constraints import (
-    EQUALITY_TOLERANCE,
-    Constraint,
-    ConstraintTerm,
-    bind_all,
-    by_name,
-    goals_of,
-    names_of,
-    violated,
-)
 from lqrsim.problem.control_rate import ControlRate, RateLimits
-from lqrsim.problem.costs import Cost, CostSum, CostTerm, in_system, terms_of
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import Noise, NoiseTerm
 from lqrsim.problem.obstacles import KeepsClear
+from lqrsim.problem.parts import (
+    EQUALITY_TOLERANCE,
+    Constraint,
+    ConstraintTerm,
+    Cost,
+    CostSum,
+    CostTerm,
+    bind_all,
+    by_name,
+    goals_of,
+    in_system,
+    names_of,
+    terms_of,
+    violated,
+)
 from lqrsim.problem.quadratic_cost import QuadraticCost, about_state, references_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates, Limits, PerEntry

@@ -21,8 +21,8 @@ from lqrsim.errors import (
     numbers_of,
 )
 from lqrsim.kernels.declarations import M, N
-from lqrsim.problem.costs import Cost, CostTerm, terms_of
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.parts import Cost, CostTerm, terms_of
 from lqrsim.results.coordinates import Coordinates
 
 # One number for each entry, or by name or unit of an entry; each of them may have one row or number for each knot.

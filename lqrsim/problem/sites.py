@@ -29,10 +29,9 @@ from lqrsim.kernels.mjcf_dynamics import (
     write_positions,
 )
 from lqrsim.kernels.rotation_ratios import cotangent_ratio
-from lqrsim.problem.constraints import STEPS, Constraint, ConstraintTerm
-from lqrsim.problem.costs import Cost, CostTerm, Residual
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.mjcf_dynamics import MjcfDynamics, MjcfMemory
+from lqrsim.problem.parts import STEPS, Constraint, ConstraintTerm, Cost, CostTerm, Residual
 from lqrsim.scenes.mjcf_kinematics import axes_of, posed
 from lqrsim.scenes.mujoco_log import mujoco, unlogged
 from lqrsim.scenes.world import SPACE

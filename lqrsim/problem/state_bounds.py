@@ -11,9 +11,8 @@ import numpy.typing as npt
 from lqrsim.annotations import NonNegative, checked
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array, InputError, check_array, check_items, check_name, check_number, numbers_of
-from lqrsim.problem.constraints import Constraint, ConstraintTerm, Side, by_name
-from lqrsim.problem.costs import Cost, CostTerm
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.parts import Constraint, ConstraintTerm, Cost, CostTerm, Side, by_name
 
 Bounds = tuple[npt.ArrayLike, npt.ArrayLike]  # low and high, as given
 

@@ -24,11 +24,10 @@ from lqrsim.errors import (
     vectors_of,
 )
 from lqrsim.problem.collision_shape import CollisionGeoms, MjcfBalls, ShapeInWorld
-from lqrsim.problem.constraints import Constraint
 from lqrsim.problem.control_rate import ControlRate
-from lqrsim.problem.costs import Cost
 from lqrsim.problem.mjcf_dynamics import ForceLimit, ForceLimits, MjcfDynamics, limited_forces
 from lqrsim.problem.obstacles import Clearance, ObstacleCost, SelfClearance
+from lqrsim.problem.parts import Constraint, Cost
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.problem.quadratic_cost import ControlCost, QuadraticCost
 from lqrsim.problem.state_bounds import LimitCost, StateBounds

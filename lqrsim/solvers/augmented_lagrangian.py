@@ -18,8 +18,7 @@ import numpy as np
 from lqrsim.errors import Array
 from lqrsim.kernels import declarations
 from lqrsim.kernels.records import LOG, Motion
-from lqrsim.problem.constraints import allowed_violation, violation_of
-from lqrsim.problem.costs import weighing_obstacles
+from lqrsim.problem.parts import allowed_violation, violation_of, weighing_obstacles
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution_parts import Moments, Multipliers, Status
 from lqrsim.solvers.compiled import ConstraintMultipliers

@@ -33,8 +33,8 @@ from lqrsim.kernels.declarations import (
 )
 from lqrsim.kernels.records import Motion
 from lqrsim.kernels.runge_kutta import advance, step_jacobian
-from lqrsim.problem.constraints import Constraint, ConstraintTerm, names_of
 from lqrsim.problem.dynamics import Dynamics
+from lqrsim.problem.parts import Constraint, ConstraintTerm, names_of
 from lqrsim.problem.problem import ACCURATE, Problem
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import BetweenKnots, Status, Trajectory

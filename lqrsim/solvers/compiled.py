@@ -18,10 +18,9 @@ from lqrsim.errors import Array
 from lqrsim.kernels import augmented_lagrangian, iterations, linear_algebra, model_functions, records
 from lqrsim.kernels.declarations import FIRST, MARGIN, MULTIPLIERS, PENALTY, PRICE, ROWS
 from lqrsim.kernels.records import CostModel, DynamicsModel, Motion, NoiseModel, Policy, ProblemModel
-from lqrsim.problem.constraints import ConstraintTerm
-from lqrsim.problem.costs import CostTerm
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.noise import NoiseTerm
+from lqrsim.problem.parts import ConstraintTerm, CostTerm
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.policy import AffinePolicy
 

@@ -26,8 +26,8 @@ from scipy.linalg.lapack import dposv  # pyright: ignore[reportAttributeAccessIs
 from lqrsim.annotations import Bounds, Positive, checked
 from lqrsim.codegen.user_functions import UserFunction, interrupt_of, raised_by
 from lqrsim.errors import Array, InputError, check_array, check_function, excerpt, real
-from lqrsim.problem.costs import terms_of
 from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
+from lqrsim.problem.parts import terms_of
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Iteration, Quadratic, Status
 from lqrsim.solvers import compiled

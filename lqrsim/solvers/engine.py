@@ -16,8 +16,8 @@ from lqrsim.errors import Array, InputError
 from lqrsim.kernels import declarations, records
 from lqrsim.kernels.iterations import DAMPED_STEPS, NEWTON_STEPS
 from lqrsim.kernels.records import CERTIFICATE, LOG, CostToGo, Descent, Motion, Policy, Prior, StructuredArray, zeros_of
-from lqrsim.problem.constraints import allowed_violation, violation_of
 from lqrsim.problem.derivative_check import check_start, functions_of
+from lqrsim.problem.parts import allowed_violation, violation_of
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import (
     Candidate,

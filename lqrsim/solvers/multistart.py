@@ -23,8 +23,8 @@ from scipy.spatial import KDTree
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels.records import Motion
-from lqrsim.problem.costs import CostSum, terms_of, weighing_obstacles
 from lqrsim.problem.derivative_check import functions_of
+from lqrsim.problem.parts import CostSum, terms_of, weighing_obstacles
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution_parts import Trajectory
 from lqrsim.solvers import compiled

@@ -10,9 +10,9 @@ from lqrsim.annotations import Positive, checked
 from lqrsim.codegen.user_functions import raised_by
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels.records import Motion, Policy
-from lqrsim.problem.constraints import EQUALITY_TOLERANCE, allowed_violation, violation_of
 from lqrsim.problem.control_rate import with_last_command
 from lqrsim.problem.derivative_check import functions_of
+from lqrsim.problem.parts import EQUALITY_TOLERANCE, allowed_violation, violation_of
 from lqrsim.problem.problem import Problem
 from lqrsim.results.pickles import OneVersion
 from lqrsim.results.solution import Plan, Replan

@@ -19,8 +19,8 @@ import numpy as np
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import declarations
 from lqrsim.kernels.records import Motion
-from lqrsim.problem.constraints import goals_of
 from lqrsim.problem.derivative_check import check_functions
+from lqrsim.problem.parts import goals_of
 from lqrsim.problem.problem import Problem
 from lqrsim.problem.quadratic_cost import QuadraticCost
 from lqrsim.results.goal import TOLERANCE, Target

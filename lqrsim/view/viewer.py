@@ -18,8 +18,7 @@ import numpy as np
 from lqrsim.control.controllers import Controller, ControllerLike, ControllerRun
 from lqrsim.control.replanner import LiveReplanner
 from lqrsim.errors import Array, InputError, free_name
-from lqrsim.problem.constraints import goals_of
-from lqrsim.problem.costs import Cost, CostSum, terms_of
+from lqrsim.problem.parts import Cost, CostSum, goals_of, terms_of
 from lqrsim.problem.problem import Problem
 from lqrsim.problem.quadratic_cost import references_of
 from lqrsim.results.archive import sha256

@@ -8,7 +8,7 @@ from oracle import kkt
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.problem.costs import terms_of
+from lqrsim.problem.parts import terms_of
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.problem.costs import Cost, terms_of
+from lqrsim.problem.parts import Cost, terms_of
 
 TINY = 1e-30
 

@@ -9,7 +9,7 @@ from scipy.optimize import lsq_linear
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.problem.costs import terms_of
+from lqrsim.problem.parts import terms_of
 from lqrsim.results.solution_parts import Status
 
 # Rounding, of sums of a few hundred terms, and of a step that may amplify it a thousandfold.

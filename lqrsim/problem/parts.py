@@ -1,0 +1,569 @@
+"""The costs and constraints of a problem, and the terms that they become for one system.
+
+The structure of a term is source text, its numbers are data. `+` composes costs. Constraints are numbers that must be
+nonnegative, or zero, besides the limits of the controls.
+
+To add a kind, state it as a formula with `SymbolicCost` or `SymbolicConstraint`; or subclass `Cost` or `Constraint` in
+a file of its own, with its kernel, and write `bind`.
+"""
+
+import abc
+import functools
+import operator
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Self, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from lqrsim.annotations import Index, Want, checked
+from lqrsim.codegen.plain import plain_functions
+from lqrsim.codegen.sources import Source, source_of
+from lqrsim.codegen.user_functions import Term, address_of
+from lqrsim.errors import Array, InputError, brief, check_count, check_items, check_kind, excerpt
+from lqrsim.kernels.declarations import N, loss, places, places_jacobian, stack
+from lqrsim.kernels.linear_algebra import clear
+from lqrsim.problem.dynamics import Dynamics
+from lqrsim.results.solution_parts import Horizon, Trajectory, left_after
+
+if TYPE_CHECKING:
+    from lqrsim.problem.obstacles import KeepsClear
+    from lqrsim.problem.quadratic_cost import ControlCost, QuadraticCost
+
+EQUALITY_TOLERANCE = 1e-6  # tolerance of equalities, unless `constraint_tolerance` is smaller
+STEPS = ("all", "final")  # the steps at which a constraint can act
+Side = float | Array  # a bound, or one for each knot, (K,)
+_Value = TypeVar("_Value")
+
+
+@dataclass(frozen=True, eq=False)
+class Residual(Term):
+    """Numbers that depend on the states, for one system, such as distances or errors.
+
+    `CostTerm.of_residual` adds a loss of each, and `ConstraintTerm.of_residual` says which values are feasible.
+
+    The source defines `residual(x, data, out)`, which writes one number per row, and `residual_jacobian(x, data, out,
+    slopes)`, which writes them, and their nonzero derivatives in the states (rows, N) to an array of zeros.
+
+    Attributes:
+      parts: the name of each row.
+      leading_states: number of states, from the first one on, that the numbers depend on.
+    """
+
+    parts: tuple[str, ...]
+    leading_states: int
+
+    @property
+    def rows(self) -> int:
+        return len(self.parts)
+
+    def filling(self, kernel: Source) -> Source:
+        """A kernel of costs or constraints whose open function `places` is filled with the residual."""
+        return kernel.filled(places=(self.code, "residual"), places_jacobian=(self.code, "residual_jacobian"))
+
+
+@checked
+@dataclass(frozen=True, eq=False)
+class CostTerm(Term):
+    """A cost term, for one system.
+
+    The source defines `value(x, u, t, data)` and `derivatives(x, u, t, data, hessian, gradient)`, both returning the
+    cost; the latter *adds* the Hessian (n+m, n+m) and gradient (n+m,) at the point, states before controls.
+
+    Attributes:
+      nonconvex_in: indices of the entries of (x, u) in which the Hessian may be indefinite: None for a convex term. The
+        sum of all such terms is projected to the nearest positive-semidefinite matrix.
+      uses_control: whether the term depends on u (only stage costs may).
+      factor: index in `data` of a number that the whole term is proportional to, if the number may be reduced in the
+        first iterations; see `InitialPrior`. Else None.
+      exact_hessian: whether the Hessian is complete. If a part is left out on purpose, `check_derivatives` does not
+        compare the Hessian with differences.
+    """
+
+    nonconvex_in: tuple[Index, ...] | None = None
+    uses_control: bool = False
+    factor: int | None = None
+    exact_hessian: bool = True
+
+    @property
+    def _defines(self) -> Mapping[str, int]:
+        return {"value": 4, "derivatives": 6}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.factor is not None:
+            check_count("CostTerm: factor", self.factor, at_least=0, at_most=len(self.data) - 1)
+
+    @classmethod
+    def of_residual(
+        cls, residual: Residual, loss: Source, numbers: Array, *, first: int = 0, factor: int | None = None,
+        nonconvex_in: tuple[int, ...] | None = None,
+    ) -> Self:  # fmt: skip
+        """The sum of a loss of each row of a residual, whose second derivatives are left out.
+
+        Args:
+          loss: defines `loss(r, row, data)`, which returns the loss of a row and its first two derivatives in r.
+          numbers: what the loss reads; in its `data` they begin at `residual.numbers`. `factor` is an index in them.
+          first: the first step at which it acts.
+        """
+        sizes = {"ROWS": max(1, residual.rows), "LEADING_STATES": residual.leading_states, "FIRST_STEP": first}
+        return cls(
+            residual.filling(source_of(__name__, **sizes).filled(loss=loss)), np.concatenate([residual.data, numbers]),
+            nonconvex_in=nonconvex_in or None, factor=None if factor is None else len(residual.data) + factor,
+            functions=residual.functions, exact_hessian=False,
+        )  # fmt: skip
+
+
+@checked
+@dataclass(frozen=True, eq=False)
+class ConstraintTerm(Term):
+    """A constraint, made for one system: numbers at each step that must be nonnegative, or zero.
+
+    The source defines `value(x, u, t, row, data)`, which returns one of the numbers, and `slope(x, u, t, row, data,
+    gradient)`, which *adds* its gradient (n+m,), states before controls.
+
+    Attributes:
+      describe: the name of a row for messages.
+      names: a name of each row for `Problem.violations`, without numbers that may change; rows of one name count as
+        one. By default rows have their indices.
+      uses_control: whether the entries depend on u; if so, they do not act at the last knot.
+      shared: number of values that all rows share, such as the centres of balls, computed once per step. Above 0, the
+        source must define `places` and `places_jacobian`, as in `SphereCenters`, and `value` and `slope` get these
+        values (shared,) and their derivatives (shared, n) in place of x and u.
+      convex: whether the states that satisfy an inequality form a convex set: there is then no way round.
+      ranges: (rows,) the distance between the two bounds of a value that has both, infinite for others: the most that
+        counts as a typical change.
+      linear: whether the values are linear in state and control, so that no solver looks for their curvature.
+      yields: whether the robot keeps an inequality by itself, as one that clips forces. A re-plan may then violate it,
+        at a price: after a push, no plan may satisfy it.
+    """
+
+    rows: Index
+    describe: Annotated[Callable[[int], str], Want("a function of a row")]
+    uses_control: bool = False
+    equality: bool = False
+    final_only: bool = False
+    shared: Index = 0
+    convex: bool = False
+    ranges: Array | None = None
+    linear: bool = False
+    yields: bool = False
+    names: Annotated[tuple[str, ...], Want("a tuple with a name of each row")] = ()
+
+    @property
+    def _defines(self) -> Mapping[str, int]:
+        of_all = {"places": 3, "places_jacobian": 4} if self.shared else {}
+        return {"value": 5, "slope": 6, **of_all}
+
+    @property
+    def digested(self) -> list[str | Array]:
+        kind = self.equality, self.final_only
+        return [*super().digested, *([repr(kind)] if any(kind) else [])]
+
+    def __post_init__(self) -> None:
+        if (count := len(self.names)) not in (0, self.rows):
+            raise InputError(f"ConstraintTerm: names: got {count}, want none, or one for each of {self.rows} rows")
+        if self.uses_control and self.final_only:
+            raise InputError("ConstraintTerm: final_only: got True with uses_control, want one of the two")
+        super().__post_init__()
+
+    @classmethod
+    def of_residual(
+        cls, residual: Residual, least: Array, columns: Sequence[int], describe: Callable[[int], str], *,
+        equality: bool = False, final_only: bool = False,
+    ) -> Self:  # fmt: skip
+        """The constraint that each row of a residual is at least some number, or with `equality` is that number.
+
+        Args:
+          least: the numbers, (K, L): of K steps, the last of which holds from its step on.
+          columns: the index of each row's number among L.
+        """
+        shared = max(1, residual.rows)
+        rows = source_of(__name__, AT=residual.numbers, ROWS=shared)
+        return cls(
+            residual.filling(rows.filled(value=(rows, "row_value"), slope=(rows, "row_slope"))),
+            np.concatenate([residual.data, least.shape, columns, least.ravel()]), residual.rows, describe,
+            equality=equality, final_only=final_only, shared=shared, functions=residual.functions, names=residual.parts,
+        )  # fmt: skip
+
+
+_BoundTerm = TypeVar("_BoundTerm", bound=Term)
+
+
+class ProblemPart(abc.ABC, Generic[_BoundTerm]):
+    """A cost or a constraint, which can be bound to any system that it fits.
+
+    All that others ask of one is a method here, in `Cost` or in `Constraint`, with the answer of most; a kind with
+    another answer overrides it.
+    """
+
+    @abc.abstractmethod
+    def bind(self, dynamics: Dynamics) -> _BoundTerm:
+        """Bind the term to a system."""
+
+    @property
+    def by_knot(self) -> bool:
+        """Whether it has other numbers at each knot; initial and final costs may not."""
+        return False
+
+    @property
+    def moving(self) -> bool:
+        """Whether it changes with time."""
+        return self.by_knot
+
+    @property
+    def kept_clear(self) -> "KeepsClear | None":
+        """The obstacles that it keeps the robot clear of, with the robot's shape; None for others."""
+        return None
+
+    def off_place(self, dynamics: Dynamics, states: Array) -> dict[str, Array]:
+        """How far parts, such as a gripper's site, are off their places, at states (K, n): name -> (K,) in m or rad."""
+        return {}
+
+    def with_added_state(self, dynamics: Dynamics) -> Self:
+        """The same for a system with one more state, the last, of which it is independent: for a free duration, and for
+        each control with a `control_rate`. `dynamics` are those without that state.
+        """
+        got = f"a {type(self).__name__} beside one of them, which cannot have one more state"
+        raise InputError(f"duration and control_rate: got {got}, want none")
+
+    @checked
+    def ahead(self, steps: Index, *, horizon: Horizon = "shrinking") -> Self:
+        """The same for a plan that begins `steps` steps later: unchanged, unless it has numbers for each knot.
+
+        The rest of a plan, with a "shrinking" horizon, is without the first rows; a plan of the same length, with a
+        "moving" one, repeats the last row.
+        """
+        if not self.by_knot:
+            return self
+        filled = horizon == "moving"
+        return self._at_other_knots(lambda rows: left_after(min(steps, len(rows) - 1), rows, filled=filled))
+
+    def _at_other_knots(self, select: Callable[[Array], Array]) -> Self:
+        """The same with each array of rows for knots as `select` leaves it; for what has such rows."""
+        raise InputError(f"{type(self).__name__}: got rows for knots, but no method ahead, want both")
+
+    def _stated(self) -> Mapping[str, object]:
+        """The arguments that it was made from, by name."""
+        return {name: value for name, value in vars(self).items() if not name.startswith("_")}
+
+    def __repr__(self) -> str:
+        parts = [
+            f"{name}={self._brief(name, value)}"
+            for name, value in self._stated().items()
+            if not (value is None or value is False or (isinstance(value, Mapping) and not value))
+        ]
+        return f"{type(self).__name__}({', '.join(parts)})"
+
+    def _brief(self, name: str, value: object) -> str:
+        """An argument as it is printed."""
+        return brief(value)
+
+    def _bind_at(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> _BoundTerm:
+        """Bind the term to a system, for a problem.
+
+        Args:
+          times: (T+1,) in s, of the knots. goals: the final values that constraints require of states, by index.
+        """
+        return self.bind(dynamics)
+
+
+class Cost(ProblemPart[CostTerm]):
+    """One term of a cost."""
+
+    _want = "a cost such as QuadraticCost(...) or a sum of costs"
+    _must_be_clear = True  # whether a new problem refuses a start at which it is zero, if that is inside an obstacle
+
+    @property
+    def name(self) -> str:
+        return type(self).__name__
+
+    @property
+    def state_reference(self) -> "QuadraticCost | None":
+        """What it is near the states that it draws to, as a problem's start and goal; None if it draws to none."""
+        return None
+
+    @property
+    def control_reference(self) -> "ControlCost | None":
+        """What it is near the controls that it draws to, as solvers start from; None for a cost that draws to none."""
+        return None
+
+    @property
+    def contact_curvature(self) -> float:
+        """Its second derivative in the distance to an obstacle at contact, in 1/m^2, which weighs paths; or 0."""
+        return 0.0
+
+    def times(self, factor: float) -> "Cost":
+        """The cost times a number. Costs with a reference or obstacles have it: the search changes their weights."""
+        raise InputError(f"{self.name}: got no method times, want it to return the cost times a number")
+
+    def moved_to(self, state: Array, dynamics: Dynamics) -> "Cost":
+        """The cost about another state (n,). Costs with a state reference have it: a viewer moves goals."""
+        raise InputError(f"{self.name}: got no method moved_to, want it to return the cost about a state")
+
+    def _in(self, dynamics: Dynamics) -> "Cost":
+        """This cost with numbers by name in the order of a system. Raises InputError if it does not fit the system."""
+        return self
+
+    def __add__(self, other: "Cost") -> "CostSum":
+        return CostSum((*terms_of(self), *terms_of(other)))
+
+    def __radd__(self, other: object) -> "Cost":
+        """`sum(costs)` begins with 0."""
+        return self if type(other) is int and other == 0 else NotImplemented
+
+
+class CostSum(Cost):
+    """The result of `+`: the terms, in order."""
+
+    def __init__(self, terms: tuple[Cost, ...]) -> None:
+        self.terms = terms
+
+    def __repr__(self) -> str:
+        return " + ".join(map(repr, self.terms))
+
+    def ahead(self, steps: int, *, horizon: str = "shrinking") -> "CostSum":
+        return CostSum(tuple(term.ahead(steps, horizon=horizon) for term in self.terms))
+
+    def with_added_state(self, dynamics: Dynamics) -> "CostSum":
+        return CostSum(tuple(term.with_added_state(dynamics) for term in self.terms))
+
+    def bind(self, dynamics: Dynamics) -> CostTerm:
+        raise InputError("cost: got a sum of costs, want a single term: bind the `terms` one by one")
+
+
+def terms_of(cost: Cost, field: str = "cost") -> tuple[Cost, ...]:
+    """The terms of a sum; a single cost is its own."""
+    if isinstance(cost, CostSum):
+        return cost.terms
+    check_kind(field, cost, Cost, Cost._want)
+    return (cost,)
+
+
+def in_system(cost: Cost, dynamics: Dynamics, field: str = "cost") -> Cost:
+    """The cost with numbers by name in the order of a system; the same object if it has no numbers by name."""
+    terms = terms_of(cost, field)
+    ordered = tuple(term._in(dynamics) for term in terms)
+    for term in ordered:
+        if field in ("initial", "final_cost") and term.by_knot:
+            raise InputError(f"{field}: got a {term.name} with a row for each knot, want one row, such as rows[-1]")
+    return cost if all(map(operator.is_, terms, ordered)) else CostSum(ordered)
+
+
+def weighing_obstacles(cost: Cost, times: float) -> CostSum:
+    """The cost with the weights of its obstacles multiplied."""
+    return CostSum(tuple(term if term.kept_clear is None else term.times(times) for term in terms_of(cost)))
+
+
+class Constraint(ProblemPart[ConstraintTerm]):
+    """A constraint."""
+
+    # The largest violation, in its unit, of a plan along which it is refined; 0 if `_refined` returns no other.
+    _rough: float = 0.0
+
+    def final_states(self, dynamics: Dynamics) -> Mapping[int, float]:
+        """The final values that it requires of states, by their indices."""
+        return {}
+
+    def _turning_states(self, dynamics: Dynamics) -> Set[int]:
+        """The indices of the states whose final value it requires only up to whole turns."""
+        return frozenset()
+
+    def state_bounds(self, dynamics: Dynamics) -> Mapping[int, tuple[Side, Side]]:
+        """The low and the high bound, each a number or (K,) for K knots, of each state that it bounds, by its index."""
+        return {}
+
+    def _refined(self, dynamics: Dynamics, plan: Trajectory) -> "Constraint | None":
+        """What `smooth` solves again with, a few times, if a plan misses it within its periods; else None."""
+        return None
+
+
+def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int, float]:
+    """The final values that all constraints require, by the index of the state. None may contradict another."""
+    goals: dict[int, float] = {}
+    for constraint in constraints:
+        for i, number in constraint.final_states(dynamics).items():
+            if goals.setdefault(i, number) != number:
+                name = dynamics.state_coordinates.names[i]
+                raise InputError(f"constraints: got goals of {goals[i]:g} and {number:g} for {name}, want one goal")
+    return goals
+
+
+def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array) -> tuple[ConstraintTerm, ...]:
+    """The constraints for a system and the times (T+1,) in s of the knots."""
+    goals, terms = goals_of(constraints, dynamics), []
+    _check_bounds([constraint.state_bounds(dynamics) for constraint in constraints], dynamics, len(times))
+    for constraint in constraints:
+        term = constraint._bind_at(dynamics, times, goals)
+        terms.append(check_kind(f"{type(constraint).__name__}.bind", term, ConstraintTerm, "a ConstraintTerm"))
+    return tuple(terms)
+
+
+def _check_bounds(all_bounds: Sequence[Mapping[int, tuple[Side, Side]]], dynamics: Dynamics, knots: int) -> None:
+    """Raises InputError if a bound does not have a number for each knot, or those of a state leave nothing between."""
+    names = dynamics.state_coordinates.names
+    for i, sides in (item for bounds in all_bounds for item in bounds.items()):
+        for side in sides:
+            if isinstance(side, np.ndarray) and len(side) != knots:
+                want = f"one, or one for each of {knots} knots"
+                raise InputError(f"StateBounds: {names[i]}: got {len(side)} numbers, want {want}")
+    for i in {i for bounds in all_bounds for i in bounds}:
+        lows, highs = zip(*(bounds[i] for bounds in all_bounds if i in bounds), strict=True)
+        sides = functools.reduce(np.maximum, lows), functools.reduce(np.minimum, highs)
+        low, high = (np.broadcast_to(side, knots) for side in sides)
+        if crossed := np.flatnonzero(~(low < high)).tolist():
+            t, where = crossed[0], "" if len(crossed) == knots else f" at knot {crossed[0]}"
+            got = f"{names[i]} of at least {low[t]:g} and at most {high[t]:g}{where}"
+            raise InputError(f"constraints: got {got}, want bounds with room between them")
+
+
+def names_of(constraint: Constraint, term: ConstraintTerm) -> list[str]:
+    """A name of each row of a constraint that does not change with its numbers, such as "StateBounds: x low"."""
+    kind = type(constraint).__name__
+    if term.names:
+        return [f"{kind}: {name}" for name in term.names]
+    return [kind] if term.rows == 1 else [f"{kind}[{row}]" for row in range(term.rows)]
+
+
+def violation_of(term: ConstraintTerm, values: Array) -> float:
+    """The largest violation of a constraint, given its values: 0 if it is satisfied, infinite if a value is NaN."""
+    missed = float((np.abs(values) if term.equality else -values).max(initial=0.0))
+    return missed if not np.isnan(missed) else np.inf
+
+
+def allowed_violation(term: ConstraintTerm, tolerance: float, *, spared: bool = True) -> float:
+    """The largest violation that counts as none. If `tolerance` is a margin, inequalities may not be violated."""
+    if term.equality:
+        return min(tolerance, EQUALITY_TOLERANCE)
+    return 0.0 if spared else tolerance
+
+
+class PlainTerm:
+    """A cost or constraint term in plain Python, at points z = (x, u): for checks of derivatives, and of runs."""
+
+    def __init__(self, term: CostTerm | ConstraintTerm, states: int, controls: int) -> None:
+        self.shared = term.shared if isinstance(term, ConstraintTerm) else 0
+        self.states, self.size = states, states + controls
+        named = term.functions[0].parameters if term.functions else ()
+        parameters = dict(zip(named, term.data.tolist(), strict=False))
+        wanted = [name for name in ("derivatives", "value", "slope", "places_jacobian") if term.code.has(name)]
+        sizes, calls = {"N": states, "M": controls}, [function.plain_call(parameters) for function in term.functions]
+        self._functions = plain_functions(term.code, sizes, wanted, calls)
+        places = [address_of(function) if function.is_memory else float(i) for i, function in enumerate(term.functions)]
+        self._data = np.concatenate([places, term.data])
+
+    def cost(self, z: Array) -> tuple[float, Array, Array]:
+        """The cost, its gradient (n+m,) and its Hessian (n+m, n+m), before any projection."""
+        x, u = z[: self.states], z[self.states :]
+        gradient, hessian = np.zeros(self.size), np.zeros((self.size, self.size))
+        return float(self._functions["derivatives"](x, u, 1, self._data, hessian, gradient)), gradient, hessian
+
+    def value(self, z: Array, row: int, knot: int = 1) -> float:
+        """One row of the constraint at a knot."""
+        return float(self._functions["value"](*self._point(z), knot, row, self._data))
+
+    def slope(self, z: Array, row: int) -> Array:
+        """The gradient (n+m,) of one row of the constraint."""
+        gradient = np.zeros(self.size)
+        self._functions["slope"](*self._point(z), 1, row, self._data, gradient)
+        return gradient
+
+    def _point(self, z: Array) -> tuple[Array, Array]:
+        """State and control; or, in their place, the values that all rows share and their derivatives."""
+        x, u = z[: self.states], z[self.states :]
+        if not self.shared:
+            return x, u
+        at, moves = np.zeros(self.shared), np.zeros((self.shared, self.states))
+        self._functions["places_jacobian"](x, self._data, at, moves)
+        return at, moves
+
+
+def violated(
+    term: ConstraintTerm, states: Array, controls: Array, counts: npt.NDArray[np.bool_], tolerance: float
+) -> Iterator[tuple[Array, npt.NDArray[np.intp]]]:
+    """The largest violation (K,) of each run and its knot (K,), zeros for a run without one, row by row.
+
+    Args:
+      states: (K, T+1, n). controls: (K, T, m). counts: (K, T+1), whether a knot counts.
+    """
+    steps, (n, m) = controls.shape[1], (states.shape[2], controls.shape[2])
+    plain = PlainTerm(term, n, m)
+    knots = range(steps) if term.uses_control else range(steps if term.final_only else 1, steps + 1)
+    for row in range(term.rows):
+        largest, when = np.zeros(len(states)), np.zeros(len(states), dtype=np.intp)
+        for k, knot in zip(*np.nonzero(counts[:, knots.start : knots.stop]), strict=True):
+            t = int(knot) + knots.start
+            value = plain.value(np.concatenate([states[k, t], controls[k, min(t, steps - 1)]]), row, t)
+            missed = abs(value) if term.equality else -value
+            if missed > max(tolerance, largest[k]):
+                largest[k], when[k] = missed, t
+        yield largest, when
+
+
+def by_name(
+    who: str, values: object, named: Mapping[str, Any], each: str, check: Callable[[str, Any], _Value]
+) -> dict[str, _Value]:
+    """The values given for states by name, in a dictionary or by keyword."""
+    want = f"{each} by name of a state, as {who}(x=...) or {who}({{'x': ...}})"
+    check_kind(who, values, (Mapping, type(None)), want)
+    stated = dict(values or {})  # pyright: ignore[reportCallIssue, reportArgumentType]
+    check_items(who, tuple(stated), str, want)
+    for name in stated.keys() & named.keys():
+        raise InputError(f"{who}: got {excerpt(name)} twice, want each state once")
+    if not stated and not named:
+        raise InputError(f"{who}: got nothing, want {want}")
+    return {name: check(f"{who}: {excerpt(name)}", value) for name, value in {**stated, **named}.items()}
+
+
+# The kernels of residuals. `places` and `places_jacobian` are the residual, with whose data `data` begins. Of a
+# constraint it has, from AT on, the numbers below, and the table of what is subtracted from the rows, step by step; the
+# last ones hold from their step on.
+ROWS = 1  # number of rows
+LEADING_STATES = 1  # number of states, from the first on, that the residual depends on
+FIRST_STEP = 0  # the first step at which a cost acts: 1 for what cannot change at a given start
+AT = 0
+# From there on: numbers of steps in the table, and of columns; then the column of each row.
+TABLE_ROWS, EACH, COLUMNS = 0, 1, 2
+
+
+def value(x, u, t, data):
+    """The cost."""
+    total = 0.0
+    if t >= FIRST_STEP:
+        residual = stack(ROWS)
+        places(x, data, residual)
+        for row in range(ROWS):
+            cost, _, _ = loss(residual[row], row, data)
+            total += cost
+    return total
+
+
+def derivatives(x, u, t, data, hessian, gradient):
+    """Add the Hessian and the gradient, and return the cost. The residual's own curvature is left out."""
+    total = 0.0
+    if t >= FIRST_STEP:
+        residual, moves = stack(ROWS), stack(ROWS, N)
+        clear(moves, ROWS, N)
+        places_jacobian(x, data, residual, moves)
+        for row in range(ROWS):
+            cost, slope, curvature = loss(residual[row], row, data)
+            total += cost
+            if slope != 0 or curvature != 0:
+                for i in range(LEADING_STATES):
+                    gradient[i] += slope * moves[row, i]
+                    for j in range(LEADING_STATES):
+                        hessian[i, j] += curvature * moves[row, i] * moves[row, j]
+    return total
+
+
+def row_value(at, u, t, row, data):
+    """The row minus its number, given the whole residual."""
+    steps, each, column = int(data[AT + TABLE_ROWS]), int(data[AT + EACH]), int(data[AT + COLUMNS + row])
+    return at[row] - data[AT + COLUMNS + ROWS + min(t, steps - 1) * each + column]
+
+
+def row_slope(at, jacobian, t, row, data, gradient):
+    """Add its gradient, given the whole residual and its derivatives in the states."""
+    for i in range(N):
+        gradient[i] += jacobian[row, i]
