@@ -1181,7 +1181,7 @@ class TestParts:
         for wanted in (pose, *([] if touching else [{name: pose[name]} for name in pose])):
             of_term(ls.SiteCost("tip", **wanted).bind(robot.dynamics), x, u)
             of_constraint(ls.SiteConstraint("tip", **wanted).bind(robot.dynamics), 1, x, u)
-        _, data = robot.geoms.in_world(robot.dynamics, world)._to_each()
+        data = robot.geoms.in_world(robot.dynamics, world)._to_each._addressed(1e6)
         source, sizes, states = source_of(mjcf_dynamics), {"N": n, "M": m, "W": n + m}, np.stack([x, 1.1 * x])
         scratch = np.zeros(3), np.zeros((3, 6))
         replay(source, sizes, "distances_of", 2, states, 1, np.linspace(0.0, 0.2, 12), data, np.zeros(4), *scratch)
