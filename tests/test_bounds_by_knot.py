@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import constraints
-from sampling import examples
+from sampling import examples, is_short
 from shooting import Shooting
 from systems import linear
 
@@ -53,8 +53,12 @@ def drawn(seed: int, steps: int, n: int, m: int) -> tuple[ls.Problem, Array, Arr
     return dataclasses.replace(problem, constraints=[ls.StateBounds(sides)] if sides else []), low, high
 
 
+# Of states and controls: where few are drawn, those for which other tests have solvers.
+SIZES = [(2, 1), (3, 2), (2, 2) if is_short() else (1, 1)]
+
+
 @settings(max_examples=examples(25))
-@given(seed=st.integers(0, 2**31), steps=st.integers(1, 8), size=st.sampled_from([(1, 1), (2, 1), (3, 2)]))
+@given(seed=st.integers(0, 2**31), steps=st.integers(1, 8), size=st.sampled_from(SIZES))
 def test_plans_meet_the_conditions_of_an_optimum(seed: int, steps: int, size: tuple[int, int]) -> None:
     """The problem is convex, so that this is the optimum. The cost is right to 1e-10, and the slope to its root."""
     problem, low, high = drawn(seed, steps, *size)
