@@ -28,8 +28,8 @@ from lqrsim.control.controllers import OutputFeedback, as_controller
 from lqrsim.errors import Array
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.scenarios.references import disturbance_set
-from lqrsim.stress.policies import make_controller
 from lqrsim.stress.statistics import rate
+from lqrsim.stress.study import make_controller
 from lqrsim.types import OutputFeedbackPolicy
 
 ROBOTS = ("differential_drive", "quadrotor")

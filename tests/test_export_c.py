@@ -24,8 +24,8 @@ from lqrsim.cli import main
 from lqrsim.control.controllers import as_controller
 from lqrsim.errors import Array
 from lqrsim.scenarios.references import disturbance_set
-from lqrsim.stress.policies import make_controller
 from lqrsim.stress.statistics import rate
+from lqrsim.stress.study import make_controller
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler, cc")
 needs_arm = pytest.mark.skipif(

@@ -21,7 +21,7 @@ from lqrsim.cli import main
 from lqrsim.commands.options import stated
 from lqrsim.commands.stressing import Break, Rare
 from lqrsim.scenarios.solutions import remarks
-from lqrsim.stress.policies import solve_policies
+from lqrsim.stress.study import solve_policies
 from lqrsim.verify import ran_policy_of
 from lqrsim.view import viewer
 

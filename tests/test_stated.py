@@ -17,7 +17,8 @@ from lqrsim.disturbances import AxleMismatch, ControlNoise, MeasurementNoise, Mo
 from lqrsim.errors import InputError
 from lqrsim.reports import COLOURS, LINES, MARKERS
 from lqrsim.stress.campaign import _code
-from lqrsim.stress.policies import (
+from lqrsim.stress.results import read_manifest
+from lqrsim.stress.study import (
     CAMPAIGN_POLICIES,
     CONTROLLERS,
     DEFAULT_POLICIES,
@@ -27,7 +28,6 @@ from lqrsim.stress.policies import (
     make_controller,
     solve_policies,
 )
-from lqrsim.stress.results import read_manifest
 
 LIGHT = (
     ControlNoise(0.02),

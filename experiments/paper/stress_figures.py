@@ -9,7 +9,7 @@ from runner import FolderSettings, Result
 
 from lqrsim.reports import COLOURS, LINES, MARKERS
 from lqrsim.simulation.disturbances import PRESETS
-from lqrsim.stress.policies import POLICIES
+from lqrsim.stress.study import POLICIES
 from lqrsim.view import style
 from lqrsim.view.style import LIMIT, PLAN, RUNS
 from paper.common import figure

@@ -285,7 +285,7 @@ class Simulate:
     def run(self) -> int:
         from lqrsim.scenarios.references import disturbance_set
         from lqrsim.simulation.effects import tube_under
-        from lqrsim.stress.policies import DEFAULT_DESIGN, DESIGNED, check_designed, make_controller
+        from lqrsim.stress.study import DEFAULT_DESIGN, DESIGNED, check_designed, make_controller
 
         if self.open_loop and self.controller != "feedback":
             raise ls.InputError(f"--open-loop: got --controller {self.controller} as well, want one of the two")
@@ -451,7 +451,7 @@ class Demo:
     def run(self) -> int:
         from lqrsim.control.controllers import BeliefFeedback
         from lqrsim.scenarios.references import folder_name, from_anywhere, resolve
-        from lqrsim.stress.policies import make_controller
+        from lqrsim.stress.study import make_controller
         from lqrsim.view import cameras, gl
 
         console.check_output("--out", self.out)

@@ -163,7 +163,7 @@ class View:
     def run(self) -> int:
         from lqrsim.errors import check_count, check_number, check_seed
         from lqrsim.scenarios.references import resolve
-        from lqrsim.stress.policies import check_designed, make_controller
+        from lqrsim.stress.study import check_designed, make_controller
         from lqrsim.view import viewer
 
         check_number("--speed", self.speed, at_least=0.01, at_most=100)

@@ -24,10 +24,9 @@ from lqrsim.scenarios.packaged import Scenario
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.simulation.effects import uncertainty_of
 from lqrsim.stress import analysis
-from lqrsim.stress.policies import DESIGNED, design_disturbances
 from lqrsim.stress.results import Results, replay
 from lqrsim.stress.statistics import Estimate
-from lqrsim.stress.study import Campaign, Cell
+from lqrsim.stress.study import DESIGNED, Campaign, Cell, design_disturbances
 from lqrsim.view import gl, style
 from lqrsim.view.style import RUNS
 

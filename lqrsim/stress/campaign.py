@@ -51,9 +51,7 @@ from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.stress import policies
 from lqrsim.stress.analysis import COLUMNS, outcomes
-from lqrsim.stress.policies import POLICY_KINDS, make_controller
 from lqrsim.stress.results import (
     MANIFEST,
     SOLUTION_FILE,
@@ -66,7 +64,21 @@ from lqrsim.stress.results import (
     write,
     write_manifest,
 )
-from lqrsim.stress.study import Campaign, Cell, Shard, Trials
+from lqrsim.stress.study import (
+    CAMPAIGN_POLICIES,
+    DEFAULT_POLICIES,
+    DESIGNED,
+    POLICY_KINDS,
+    Campaign,
+    Cell,
+    Shard,
+    Trials,
+    check_used,
+    design_uncertainty,
+    impossible_policies,
+    make_controller,
+    solve_policies,
+)
 
 _log = logging.getLogger("lqrsim")
 
@@ -220,12 +232,12 @@ def _check_runnable(campaign: Campaign) -> list[list[Any]]:
     """
     scenario, given = campaign.resolved, campaign.given
     problem, plant = scenario.problem, scenario.plant()
-    impossible = policies.impossible_policies(scenario, given)
+    impossible = impossible_policies(scenario, given)
     for policy in campaign.policies:
         if policy in impossible:
-            possible = ", ".join(name for name in policies.CAMPAIGN_POLICIES if name not in impossible)
+            possible = ", ".join(name for name in CAMPAIGN_POLICIES if name not in impossible)
             raise InputError(f"policies: got {policy}, {impossible[policy]}, want some of {possible}")
-    policies.check_used(given, campaign.policies)
+    check_used(given, campaign.policies)
     if problem.duration is None:
         plant.substeps(problem.dt)
     _ = campaign.goal_options  # raises InputError if they do not fit
@@ -237,12 +249,12 @@ def _check_runnable(campaign: Campaign) -> list[list[Any]]:
         except InputError as error:
             raise InputError(f"sweeps: {sweep} at strength {strength:g}: {error}") from None
         deterministic += [] if any(drawn) else [[sweep, strength]]
-    if {*policies.DESIGNED} & {*campaign.policies}:
-        policies.design_uncertainty(scenario, campaign.design_disturbances)
+    if {*DESIGNED} & {*campaign.policies}:
+        design_uncertainty(scenario, campaign.design_disturbances)
     for cell in campaign.cells:
-        if policies.POLICY_KINDS[cell.policy].per_cell:
+        if POLICY_KINDS[cell.policy].per_cell:
             try:
-                policies.design_uncertainty(scenario, campaign.disturbances(cell))
+                design_uncertainty(scenario, campaign.disturbances(cell))
             except InputError as error:
                 raise InputError(f"policies: {cell.policy} for {cell.sweep}: {error}") from None
     if campaign.replan_every is not None and campaign.replan_every < 0.999 * problem.dt:
@@ -291,9 +303,9 @@ def _specification(campaign: Campaign) -> dict[str, Any]:
 def _begin(campaign: Campaign, specification: dict[str, Any], folder: Path) -> None:
     """Solve; write the solutions and, at last, the manifest, with which the folder is that of a campaign."""
     scenario, given, design = campaign.resolved, campaign.given, campaign.design_disturbances
-    solutions = policies.solve_policies(campaign.policies, scenario, design, given)
-    for policy in {*policies.DESIGNED} & {*campaign.policies}:  # nothing is written if a controller cannot be made
-        policies.make_controller(policies.POLICY_KINDS[policy].controller, scenario, solutions[policy], design=design)
+    solutions = solve_policies(campaign.policies, scenario, design, given)
+    for policy in {*DESIGNED} & {*campaign.policies}:  # nothing is written if a controller cannot be made
+        make_controller(POLICY_KINDS[policy].controller, scenario, solutions[policy], design=design)
     hashes = dict[str, dict[str, str]]()
     for policy, solution in solutions.items():
         path = save_load.save(solution, folder / "policies" / f"{policy}.npz")
@@ -301,10 +313,10 @@ def _begin(campaign: Campaign, specification: dict[str, Any], folder: Path) -> N
     if given is not None:
         save_load.save(given, folder / SOLUTION_FILE)
     remarks = [f"{name} {line}" for name, plan in solutions.items() for line in solving.remarks(scenario, plan)]
-    impossible = policies.impossible_policies(scenario, given)
-    missing = "; ".join(f"{name}, {impossible[name]}" for name in policies.DEFAULT_POLICIES if name in impossible)
+    impossible = impossible_policies(scenario, given)
+    missing = "; ".join(f"{name}, {impossible[name]}" for name in DEFAULT_POLICIES if name in impossible)
     # Policies that were chosen leave out others on purpose.
-    by_default = {*campaign.policies} == {*policies.DEFAULT_POLICIES} - {*impossible}
+    by_default = {*campaign.policies} == {*DEFAULT_POLICIES} - {*impossible}
     write_manifest(folder, specification | {
         "policies": hashes, "versions": versions(), "machine": description(), "remarks": remarks,
         "left_out": f"left out: {missing}" if missing and by_default else "",

@@ -37,9 +37,8 @@ from lqrsim.scenarios.solutions import digest_of_solution
 from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress import analysis
 from lqrsim.stress.analysis import COLUMNS, Outcomes, outcomes
-from lqrsim.stress.policies import DEFAULT_DESIGN, POLICY_KINDS
 from lqrsim.stress.statistics import CONFIDENCE
-from lqrsim.stress.study import CAMPAIGN_FIELDS, Campaign, Cell, Shard, Trials
+from lqrsim.stress.study import CAMPAIGN_FIELDS, DEFAULT_DESIGN, POLICY_KINDS, Campaign, Cell, Shard, Trials
 
 Columns = dict[str, npt.NDArray[np.generic]]  # of the table of a shard, by name
 _KEY = b"lqrsim shard"

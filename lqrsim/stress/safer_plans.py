@@ -45,9 +45,9 @@ from lqrsim.solvers.compiled import costs_of
 from lqrsim.solvers.smoother import smooth
 from lqrsim.stress.failure_search import RareFailures, ReliabilityProblem, Report, write_json
 from lqrsim.stress.funnels import MOST_TRIALS
-from lqrsim.stress.policies import DESIGNED, design_uncertainty, make_controller
 from lqrsim.stress.reliability import NoFailure
 from lqrsim.stress.statistics import CONFIDENCE, Estimate, rate
+from lqrsim.stress.study import DESIGNED, design_uncertainty, make_controller
 
 POLICIES = ("smooth", *DESIGNED)  # whose law can be designed for any plan, and predicted
 AIMED_FRACTION = 0.5  # of the requested probability, so that the measured one's whole interval is likely to be below it
