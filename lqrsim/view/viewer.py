@@ -31,7 +31,7 @@ from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, Effect
 from lqrsim.simulation.plant import Plant
 from lqrsim.view.overlays import Line, MovingBody, Shape, rgba_of
-from lqrsim.view.recorded_trial import POINT, floor_below, interpolated, model_of, place_of, robot_body
+from lqrsim.view.recorded_trial import POINT, RecordedTrial, floor_below, interpolated, place_of, robot_body
 
 GHOST_OPACITY = 0.25
 TRACE_RGBA = (0.05, 0.35, 0.62, 1.0)
@@ -469,12 +469,9 @@ def lengthened(solution: Solution) -> Solution:
 
 def arguments_for_rollout(rollout: Rollout, trial: int) -> dict[str, Any]:
     """Arguments of a Viewer for one trial."""
-    model = model_of(rollout, trial)
-    if not np.isfinite(rollout.frames[trial]).all(axis=1).any():
-        raise InputError(f"rollout: got trial {trial} without a finite state, want one that can be shown")
     return {
-        "model": model, "plan": rollout.plan, "space": rollout.state_coordinates, "body": rollout.body,
-        "radius": rollout.radius, "balls": rollout.balls,
+        "model": RecordedTrial(rollout, trial).model, "plan": rollout.plan, "space": rollout.state_coordinates,
+        "body": rollout.body, "radius": rollout.radius, "balls": rollout.balls,
     }  # fmt: skip
 
 
@@ -506,12 +503,11 @@ class _UserForces(Disturbance):
 
 def play(rollout: Rollout, viewer: Viewer, *, trial: int = 0, loop: bool = True) -> None:
     """Show the frames of one trial in time, once or in a loop, until the viewer is closed."""
-    finite = np.isfinite(rollout.frames[trial]).all(axis=1)
-    frames = list(zip(rollout.frame_times[finite].tolist(), rollout.frames[trial][finite], strict=True))
+    recorded = RecordedTrial(rollout, trial)
     with contextlib.suppress(ViewerClosed):
         while True:
             with contextlib.suppress(RestartRequested):
-                for time, qpos in frames:
+                for time, qpos in zip(recorded.frame_times.tolist(), recorded.frames, strict=True):
                     viewer.show(time, qpos)
                 viewer.wait(PAUSE_SECONDS if loop else np.inf)
 
