@@ -137,7 +137,7 @@ class Replay:
 
 
 @dataclass(frozen=True, kw_only=True)
-@options_of("reports/__init__.py", "report", videos="INT")
+@options_of("reports.py", "report", videos="INT")
 class Report:
     """Write the report of a stress test: a page, or a table for a paper.
 
