@@ -16,7 +16,7 @@ BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 def test_code_blocks_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # they write files
     # The README renders 25 s in 720p, which takes over a minute; small and coarse it is the same code.
-    monkeypatch.setattr(ls, "render", partial(ls.render, size=(320, 180), fps=5), raising=False)
+    monkeypatch.setattr(ls, "render", partial(ls.render, size=(320, 180), fps=1), raising=False)
     text = README.read_text(encoding="utf-8")
     blocks = list(BLOCK.finditer(text))
     assert blocks, "the README has no Python"
