@@ -57,11 +57,18 @@ def test_an_untouched_plan_is_verified(solved: tuple[ls.Problem, ls.Solution]) -
     assert found.cost == pytest.approx(solution.cost, rel=1e-9)
 
 
+def astray(matrix: np.ndarray, target: np.ndarray, **options: Any) -> tuple[np.ndarray, float]:
+    """What SciPy's `nnls` does now and then: a point that is not the optimum, here the origin, for one that is."""
+    return np.zeros(matrix.shape[1]), float(np.linalg.norm(target))
+
+
 @pytest.mark.parametrize("seed", range(12))
-def test_optimality_is_zero_at_the_optimum_and_nowhere_else(seed: int) -> None:
+def test_optimality_is_zero_at_the_optimum_and_nowhere_else(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of linear dynamics with quadratic costs, limits and a goal or none, whose optimum SciPy's bounded least squares
     finds. The residual is right to rounding times the condition of the dynamics, and 1e-7 is far from both sides.
     """
+    if seed % 3 == 0:
+        monkeypatch.setattr("scipy.optimize.nnls", astray)
     rng = np.random.default_rng(seed)
     n, m, steps = int(rng.integers(2, 4)), int(rng.integers(1, 3)), int(rng.integers(6, 14))
     a, b = rng.normal(size=(n, n)) - np.eye(n), rng.normal(size=(n, m))

@@ -1,4 +1,4 @@
-"""Whether a plan is what a solver says of it, in plain NumPy: nothing of lqrsim's or the other solvers' is used.
+"""Whether a plan is what a solver says of it, in plain NumPy: nothing of lqrsim's or the other solvers' is believed.
 
 Dynamics, costs and constraints are evaluated anew by `oracle/kkt.py` and `constraints.py`: formulas through
 SymPy's `lambdify`, distances from geometry.
@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from oracle import constraints, kkt
 from scipy import sparse
-from scipy.optimize import nnls
 from scipy.sparse.linalg import splu
 
 import lqrsim as ls
 from lqrsim.errors import Array
+from lqrsim.scenes.mjcf_holding import nonnegative_least_squares
 
 VIOLATION = 1e-6  # what counts as kept: dynamics, start, limits and constraints
 NEAR = 1e-3  # how near its limit an inequality is that may have a multiplier
@@ -132,8 +132,10 @@ def _optimality(problem: ls.Problem, plan: ls.Trajectory) -> float:
     pulls = sparse.block_array([[pulls], [sparse.csc_array((len(near), pulls.shape[1]))]], format="csc")
     wanted = np.append(slope[kept], np.zeros(len(near)))
     left = _left_of(np.column_stack([wanted, signed]), pulls)
-    # SciPy 1.17 ends the process if there is nothing to choose.
-    pushes = nnls(left[:, 1:], left[:, 0], maxiter=100 * len(near))[0] if len(near) else np.zeros(0)
+    # SciPy 1.17 ends the process if there is nothing to choose. Any other multipliers that are not negative leave more,
+    # so that no fault of what finds them makes a plan optimal.
+    pushes = nonnegative_least_squares(left[:, 1:], left[:, 0]) if len(near) else np.zeros(0)
+    assert (pushes >= 0).all()
     return float(np.abs(left[:, 0] - left[:, 1:] @ pushes).max() / np.abs(wanted).max())
 
 
