@@ -162,9 +162,9 @@ class Budget:
                 self._callback(iteration)
 
     @contextlib.contextmanager
-    def limited(self, most: int) -> Iterator[None]:
-        """Temporarily allow at most this number of further iterations."""
-        before, self._most = self._most, min(self._most, len(self.log) + most)
+    def limited(self, most: int | None) -> Iterator[None]:
+        """Temporarily allow at most this number of further iterations, or as many as before."""
+        before, self._most = self._most, self._most if most is None else min(self._most, len(self.log) + most)
         try:
             yield
         finally:

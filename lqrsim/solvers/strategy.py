@@ -65,6 +65,7 @@ LEAST_WAY = 0.1  # least way of a joint, relative to the longest, by which its w
 NONE = 1e-9  # change of a state, relative to its size, that counts as none
 
 Finish = Callable[[SolveRun, Known], RunResult]
+Start = StartLike | InitialGuess
 
 
 class Search:
@@ -72,7 +73,7 @@ class Search:
 
     def __init__(
         self, problem: Problem, settings: SmootherSettings, stop: Stop,
-        starts: Sequence[tuple[str, StartLike | InitialGuess]] = (),
+        starts: Sequence[tuple[str, Start]] = (),
     ) -> None:  # fmt: skip
         """By default from the caller's start, or the usual ones."""
         self._problem, self._settings, self._stop, self._threads = problem, settings, stop, stop.threads
@@ -89,7 +90,7 @@ class Search:
         self._solving = self._threads if len(self._named) == 1 else 1
         self._known = Known()
         self._finished: list[tuple[SolveRun, RunResult]] = []
-        self._unmoved_of: tuple[RunResult | None, list[int]] = None, []  # the plan of which `_unmoved` spoke last
+        self._unmoved_of = dict[RunResult, list[int]]()  # by the plan
         # A plan and states that miss their goal, which no control changes along it; the best plan that brings them
         # nearer, with the name of its start; the approaches that were tried; and the name and the cost of the cheapest
         # start that brings them nearer.
@@ -190,7 +191,7 @@ class Search:
         unfinished = Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.RISK_TOO_HIGH
         if run.ending.success or run.ending.status in unfinished or self._stop.due:
             return run
-        line = self._add(resolve(line_of_states(self._problem), self._problem), "a line of states")
+        line = self._add(line_of_states(self._problem), "a line of states")
         line.budget.report()
         line.smooth(self._settings.max_iterations)
         return line if line.ending.success or line.work.cost < run.work.cost else run
@@ -218,7 +219,7 @@ class Search:
             if stop.due:
                 return
             heavier = multistart.reweighted(self._problem, times)
-            runs = [self._another(resolve(guide, heavier), heavier) for _, guide in guides(heavier, None)]
+            runs = [self._another(guide, heavier) for _, guide in guides(heavier, None)]
             try:
                 chosen = choose(runs, self._threads)[0]
                 chosen.budget.report()
@@ -290,7 +291,7 @@ class Search:
         for name, prior in multistart.along_paths(problem, self._steered(), cost if 0 < cost < np.inf else 1.0).items():
             if self._stop.due:
                 break
-            run = self._another(resolve(prior, problem))
+            run = self._another(prior)
             run.smooth(multistart.FOLLOW)
             plan = copied(run.work.arrays.last)
             if np.isfinite(plan.states).all():
@@ -312,8 +313,7 @@ class Search:
         return sorted(moving)
 
     def try_sinusoidal_controls(self) -> None:
-        problem = self._problem
-        runs = [self._another(resolve(sinusoidal_controls(problem, cycles), problem)) for cycles in SWAYS]
+        runs = [self._another(sinusoidal_controls(self._problem, cycles)) for cycles in SWAYS]
         chosen = choose(runs, self._threads)[0]
         self._named.append((sinusoidal_name(SWAYS[runs.index(chosen)]), chosen))
         result, best = self._finish(chosen, known=Known()), self.best[1]
@@ -388,9 +388,9 @@ class Search:
         """
         problem, before, places = self._problem, self.best[1], self._unmoved()
         self._still = before, places
-        plans = list[tuple[bool, float, str, InitialGuess]]()
+        plans = list[tuple[bool, float, str, Start]]()
 
-        def consider(name: str, begin: InitialGuess, plan: Motion) -> bool:
+        def consider(name: str, begin: Start, plan: Motion) -> bool:
             """Keep a plan that changes these states; return whether it takes them nearer to their goal at less cost."""
             cost = compiled.cost_of(problem, *plan)
             if not (np.isfinite(cost) and differ(plan, before, places)):
@@ -400,13 +400,11 @@ class Search:
             return nearer and cost < SAVES * before.cost
 
         for name, controls, plan in multistart.pushes(problem):
-            consider(name, resolve(controls, problem), plan)
+            consider(name, controls, plan)
         for name, through in approaches(problem, before, places):
             if self._stop.due:
                 break
-            run = self._another(resolve(None, through), through)
-            with through.dynamics.solving(self._threads), run.budget.limited(APPROACH):
-                drawn = self._finish(run, refine, Known()).kept()
+            drawn = self._finish(self._another(None, through), refine, most=APPROACH).kept()
             self._approached.append(name)
             plan = compiled.rollout(problem, *drawn.law, before.states[0].copy())
             if consider(name, guess_from(drawn, name), plan):
@@ -425,8 +423,12 @@ class Search:
                 self._best_nearer = name, other
 
     def _comes_nearer(self, plan: RunResult | Motion) -> bool:
-        """Whether a plan brings states nearer to their goal that no control changed along the first plan."""
-        return self._still is not None and comes_nearer(self._problem, plan, *self._still)
+        """Whether a plan brings states, which no control changed along the first plan, well nearer to their goal."""
+        if self._still is None or not np.isfinite(plan.states[-1]).all():
+            return False
+        first, places = self._still
+        now, before = (missing(self._problem, motion.states[-1], places) for motion in (plan, first))
+        return bool(np.linalg.norm(now) < (1 - NEARER) * np.linalg.norm(before))
 
     def _is_better(self, result: RunResult) -> bool:
         """Whether a plan is better than the best."""
@@ -438,13 +440,29 @@ class Search:
 
     def _unmoved(self) -> list[int]:
         """The states that miss their goal and that no control changes along the best plan."""
-        best, allowed = self.best[1], self._allowed
+        problem, best = self._problem, self.best[1]
         if not np.isfinite(best.cost):
             return []
-        if self._unmoved_of[0] is not best:
-            places = unmoved(self._problem, best.states, best.controls, best.cost, allowed)
-            self._unmoved_of = best, places
-        return self._unmoved_of[1]
+        if best in self._unmoved_of:
+            return self._unmoved_of[best]
+        states, controls, end, goal = best.states, best.controls, best.states[-1], problem.goal
+        sizes = np.maximum(np.ptp(states, axis=0), 0.0 if goal is None else np.abs(np.nan_to_num(goal - end)))
+        sizes = np.where(sizes > 0, sizes, 1.0)
+        missed = np.abs(_final_cost(problem, end)[1]) * sizes > MOST_OF * abs(best.cost)
+        for i, number in goals_of(problem.constraints, problem.dynamics).items():
+            missed[i] |= abs(end[i] - number) > self._allowed
+        space, places = problem.control_coordinates, np.flatnonzero(missed)
+        span = np.subtract(space.high, space.low)
+        span = np.where(np.isfinite(span), span, np.maximum(np.abs(controls).max(axis=0), 1.0))
+        pull = np.eye(len(end))[places]
+        for state, control in zip(states[-2::-1], controls[::-1], strict=True):
+            if not len(places):
+                break
+            with np.errstate(all="ignore"):
+                a, b, _ = problem.dynamics.linearize(state, control, problem.dt)
+            still = (np.abs(pull @ b) * span).sum(axis=1) <= NONE * sizes[places]
+            places, pull = places[still], (pull @ a)[still]
+        return self._unmoved_of.setdefault(best, places.tolist())
 
     def keep_given(self, given: RunResult) -> None:
         """If the best plan is worse than the caller's, or has left what that moved, descend from the caller's plan."""
@@ -466,13 +484,13 @@ class Search:
         """Where the risk was too high for an intermediate plan, solve without risk, and continue from that plan."""
         riskless = replace(self._problem, risk=0.0)
         with self._problem.dynamics.solving(self._solving):
-            runs = [self._another(run.initial_guess, riskless) for _, run in self._named]
-            plan = self._finish(choose(runs, self._threads)[0], known=Known())
-            if not plan.success or self._stop.due:
-                return
-            begin = guess_from(plan, "a plan without risk")
-            run = self._add(replace(begin, cost_to_go=plan.values["cost_to_go"], multipliers=plan.multipliers))
-            result = self._finish(run)
+            runs = choose([self._another(run.initial_guess, riskless) for _, run in self._named], self._threads)
+        plan = self._finish(runs[0])
+        if not plan.success or self._stop.due:
+            return
+        begin = guess_from(plan, "a plan without risk")
+        run = self._add(replace(begin, cost_to_go=plan.values["cost_to_go"], multipliers=plan.multipliers))
+        result = self._finish(run)
         # Of plans whose risk is too high, this one is near an optimum.
         self._offer(run, result, better=result.rank <= self.best[1].rank)
 
@@ -501,7 +519,7 @@ class Search:
         for cycles, side in itertools.product(SWAYS, (1, -1)):
             if not self._stop.due:
                 begin, origin = sinusoidal_controls(widest, side * cycles), f", {sinusoidal_name(side * cycles)}"
-                results[origin] = self._solve_softly(f"{name}{origin}", widest, resolve(begin, widest), LOOK)
+                results[origin] = self._solve_softly(f"{name}{origin}", widest, begin, LOOK)
         self._stiffen(results, harder, [name], self._named[0][1].budget.left)
 
     def alternate_softness(self) -> None:
@@ -536,8 +554,7 @@ class Search:
     def leave_contact_modes(self) -> None:
         """Descend from the best plan, out of its contact modes."""
         run = self._add(guess_from(self.best[1], "the best plan"), "the best plan, out of its contact modes")
-        with self._problem.dynamics.solving(self._solving), run.budget.limited(SOFT):
-            result = self._finish(run, refine)
+        result = self._finish(run, refine, most=SOFT)
         self._offer(run, result, better=self._is_better(result))
 
     @property
@@ -568,18 +585,16 @@ class Search:
             plans = dict(sorted(plans.items(), key=lambda pair: pair[1].cost)[: -(-len(plans) // FEWER)])
         origin = min(plans, key=lambda origin: plans[origin].cost)
         run = self._add(guess_from(plans[origin], "a plan for softer contacts"))
-        with self._problem.dynamics.solving(self._threads), run.budget.limited(most):
-            ended = self._finish(run, refine)
+        ended = self._finish(run, refine, most=most)
         stages = ", ".join([*before, *(name for name, _ in soft)])
         detail = f"begun with contacts of softness {stages}{origin}; {ended.detail}".removesuffix("; ")
         ended = replace(ended, detail=detail)
         self._offer(run, ended, better=self._is_better(ended))
         return ended
 
-    def _solve_softly(self, name: str, soft: Problem, begin: InitialGuess, most: int) -> RunResult:
+    def _solve_softly(self, name: str, soft: Problem, begin: Start, most: int) -> RunResult:
         run = self._another(begin, soft)
-        with soft.dynamics.solving(self._threads), run.budget.limited(most):
-            return self._keep_softer(name, run, self._finish(run, refine, Known()))
+        return self._keep_softer(name, run, self._finish(run, refine, most=most))
 
     def _keep_softer(self, name: str, run: SolveRun, result: RunResult) -> RunResult:
         self._softer.append(run.candidate(f"contacts of softness {name}", result))
@@ -635,13 +650,22 @@ class Search:
 
     def _with_unmoved_states(self, result: RunResult) -> RunResult:
         """The result with the states that miss their goal and that no control changes; STALLED if others would."""
-        problem, places = self._problem, self._unmoved()
+        problem, places, states = self._problem, self._unmoved(), result.states
         if not places:
             return result
-        parts = described(problem, result.states, places), self._of_approaches(result), result.detail
-        otherwise = can_change(problem, result.states, places)
+        named = [problem.dynamics.state_coordinates.names[i] for i in places]
+        bodies = dict.fromkeys(filter(None, (problem.dynamics.untouched_body(states, i) for i in places)))
+        said = f"no control changes {' or '.join(named)} along this plan"
+        said += f": nothing that moves touches {' or '.join(bodies)}" if bodies else ""
+        parts = said, self._of_approaches(result, untouched=bool(bodies)), result.detail
+        # If other controls would change one of these states, the plan is on a plateau, and no optimum. They may at any
+        # time, for what sways may come back to the end.
+        gain = np.zeros((problem.steps, len(problem.nominal_control), len(states[0])))
+        sways = (sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2])
+        others = (compiled.rollout(problem, gain, controls, states[0].copy()).states for controls in sways)
+        otherwise = bool(bodies) or any((np.abs(other - states)[:, places] > NONE).any() for other in others)
         status = Status.STALLED if result.success and otherwise else result.status
-        names = ", ".join(problem.dynamics.state_coordinates.names[i] for i in places)
+        names = ", ".join(named)
         remedy = f"leave {names} out of the goal, which no control that was tried changes"
         if self._nearer is not None:
             remedy = f"raise the weight of {names} until moving it costs less than leaving it"
@@ -652,7 +676,7 @@ class Search:
             status, remedy = Status.TIME_LIMIT, ""
         return replace(result, status=status, detail="; ".join(filter(None, parts)), remedy=remedy)
 
-    def _of_approaches(self, result: RunResult) -> str:
+    def _of_approaches(self, result: RunResult, *, untouched: bool) -> str:
         """In words, what came of motions that were to bring states nearer to their goal that a plan does not change."""
         if self._nearer is not None:
             name, cost = self._nearer
@@ -660,7 +684,6 @@ class Search:
         if self._approached:
             tried = ", ".join(dict.fromkeys(self._approached))
             return f"nothing that was tried brings it nearer to its goal: {tried}"
-        untouched = any(self._problem.dynamics.untouched_body(result.states, i) for i in self._unmoved())
         known = "nothing that is driven can collide with it, or it is to turn on the spot"
         return f"no approach is known: {known}" if self._still is not None and untouched else ""
 
@@ -679,26 +702,32 @@ class Search:
         with problem.dynamics.solving(search._solving):
             return search.choose_start()
 
-    def _another(self, initial_guess: InitialGuess, problem: Problem | None = None) -> SolveRun:
+    def _another(self, start: Start, problem: Problem | None = None) -> SolveRun:
         """A run from another start, perhaps of another problem."""
-        budget = Budget(self._settings.max_iterations, self._stop)
-        start = self._problem._start_or_zero
-        return SolveRun(problem or self._problem, self._settings, initial_guess, start, budget)
+        problem, budget = problem or self._problem, Budget(self._settings.max_iterations, self._stop)
+        return SolveRun(problem, self._settings, resolve(start, problem), self._problem._start_or_zero, budget)
 
-    def _add(self, initial_guess: InitialGuess, name: str | None = None) -> SolveRun:
+    def _add(self, start: Start, name: str | None = None) -> SolveRun:
         """A run from another start that is one of the candidates."""
-        run = self._another(initial_guess)
-        self._named.append((str(initial_guess.summary) if name is None else name, run))
+        run = self._another(start)
+        self._named.append((str(run.initial_guess.summary) if name is None else name, run))
         return run
 
-    def _finish(self, run: SolveRun, how: Finish = finish, known: Known | None = None) -> RunResult:
-        """Run to the end. The callback is called for all iterations of the run, including earlier ones."""
-        run.budget.report()
-        return how(run, self._known if known is None else known)
+    def _finish(
+        self, run: SolveRun, how: Finish = finish, *, most: int | None = None, known: Known | None = None
+    ) -> RunResult:
+        """Run to the end, or `most` iterations more. The callback is called for all iterations of the run so far, too.
 
-    def _try(self, name: str, start: StartLike | InitialGuess, how: Finish = finish) -> None:
+        What is known of the search's problem is not known of another.
+        """
+        run.budget.report()
+        known = known or (self._known if run.problem is self._problem else Known())
+        with run.problem.dynamics.solving(self._threads), run.budget.limited(most):
+            return how(run, known)
+
+    def _try(self, name: str, start: Start, how: Finish = finish) -> None:
         """Finish a run from another start, which is one of the candidates, and record its result."""
-        run = self._add(resolve(start, self._problem), name)
+        run = self._add(start, name)
         self._offer(run, self._finish(run, how))
 
     def _offer(self, run: SolveRun, result: RunResult, *, better: bool | None = None) -> None:
@@ -795,31 +824,6 @@ def guess_from(result: RunResult, summary: str) -> InitialGuess:
     return InitialGuess(result.law.gain.copy(), result.law.offset.copy(), summary)
 
 
-def unmoved(problem: Problem, states: Array, controls: Array, cost: float, allowed: float) -> list[int]:
-    """States that miss their goal, of a constraint by more than `allowed`, and that no control of a plan changes."""
-    end, goal, start = states[-1], problem.goal, states[0]
-    sizes = np.maximum(np.ptp(states, axis=0), 0.0 if goal is None else np.abs(np.nan_to_num(goal - end)))
-    sizes = np.where(sizes > 0, sizes, 1.0)
-    missed = np.abs(_final_cost(problem, end)[1]) * sizes > MOST_OF * abs(cost)
-    for i, number in goals_of(problem.constraints, problem.dynamics).items():
-        missed[i] |= abs(end[i] - number) > allowed
-    if not missed.any():
-        return []
-    space = problem.control_coordinates
-    span = np.subtract(space.high, space.low)
-    span = np.where(np.isfinite(span), span, np.maximum(np.abs(controls).max(axis=0), 1.0))
-    places = np.flatnonzero(missed)
-    pull = np.eye(len(start))[places]
-    for state, control in zip(states[-2::-1], controls[::-1], strict=True):
-        with np.errstate(all="ignore"):
-            a, b, _ = problem.dynamics.linearize(state, control, problem.dt)
-        still = (np.abs(pull @ b) * span).sum(axis=1) <= NONE * sizes[places]
-        places, pull = places[still], (pull @ a)[still]
-        if not len(places):
-            break
-    return places.tolist()
-
-
 def differ(plan: RunResult | Motion, other: RunResult | Motion, places: list[int]) -> bool:
     """Whether two plans end with different values of these states."""
     return bool((np.abs(plan.states[-1] - other.states[-1])[places] > NONE).any())
@@ -849,14 +853,6 @@ def missing(problem: Problem, state: Array, places: list[int]) -> Array:
     return shortfall
 
 
-def comes_nearer(problem: Problem, plan: RunResult | Motion, other: RunResult, places: list[int]) -> bool:
-    """Whether these states end nearer to their goal in a plan than in another, by a good part of the way."""
-    if not np.isfinite(plan.states[-1]).all():
-        return False
-    ways = [missing(problem, motion.states[-1], places) for motion in (plan, other)]
-    return bool(np.linalg.norm(ways[0]) < (1 - NEARER) * np.linalg.norm(ways[1]))
-
-
 def approaches(problem: Problem, result: RunResult, places: list[int]) -> Iterator[tuple[str, Problem]]:
     """Problems in which the robot passes through a body that nothing touches, and is drawn along motions that take the
     body to its goal, in words. Their solutions are starts in which the robot touches the body, whose own goals are left
@@ -873,23 +869,3 @@ def approaches(problem: Problem, result: RunResult, places: list[int]) -> Iterat
             drawn[:, :, None] * np.diag(weights), about=np.where(drawn, about, 0.0)
         )
         yield words, replace(problem, dynamics=dynamics, constraints=constraints).with_costs(stage_cost=stage)
-
-
-def can_change(problem: Problem, states: Array, places: list[int]) -> bool:
-    """Whether other controls would change one of these states: then the plan is on a plateau, and no optimum."""
-    if any(problem.dynamics.untouched_body(states, i) for i in places):
-        return True
-    gain = np.zeros((problem.steps, len(problem.nominal_control), len(states[0])))
-    for cycles in SWAYS[:2]:
-        other, _ = compiled.rollout(problem, gain, sinusoidal_controls(problem, cycles), states[0].copy())
-        if (np.abs(other - states)[:, places] > NONE).any():  # at any time, for what sways may come back to the end
-            return True
-    return False
-
-
-def described(problem: Problem, states: Array, places: list[int]) -> str:
-    """In words: which states no control changes, and which bodies nothing touches."""
-    names = problem.dynamics.state_coordinates.names
-    text = f"no control changes {' or '.join(names[i] for i in places)} along this plan"
-    bodies = dict.fromkeys(filter(None, (problem.dynamics.untouched_body(states, i) for i in places)))
-    return text + (f": nothing that moves touches {' or '.join(bodies)}" if bodies else "")
