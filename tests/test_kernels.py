@@ -1504,7 +1504,7 @@ class TestPlanMethods:
         bent = convex.copy()
         bent[0, :3, :3] -= 1e6 * np.eye(3)
         assert direction(bent) == 4  # nor has the start
-        stages.jump([2])  # where the last state is free again
+        stages.about.jumps[2] = 1.0  # where the last state is free again
         assert direction(convex) == -1
         bent = convex.copy()
         bent[2, 2, 2] -= 1e6

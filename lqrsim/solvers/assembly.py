@@ -21,7 +21,6 @@ from lqrsim.rotations import AXES, quaternion, rotation_vector
 from lqrsim.solvers import compiled
 from lqrsim.solvers.certify import LAW, MOTION
 from lqrsim.solvers.engine import RunResult, SolveRun
-from lqrsim.solvers.risk import name_risk
 from lqrsim.solvers.settings import can_be_exact
 
 # The policies of plans through contacts are run from this many starts that differ by this much in each state.
@@ -50,7 +49,7 @@ def assemble(
     problem, log = run.problem, run.budget.log
     assert result.certificate is not None
     if result.status is Status.RISK_TOO_HIGH:
-        result = replace(result, detail=name_risk(run, result))
+        result = replace(result, detail=_with_risk(run, result))
     falls = bool(log) and result.cost < -UNBOUNDED * max(1.0, abs(log[0].cost))
     if falls and not result.success and result.status is not Status.NOT_POSITIVE_DEFINITE:
         result = replace(result, status=Status.DIVERGED, detail="the cost falls without bound")
@@ -92,6 +91,22 @@ def assemble(
         goal=problem.weighed_goal,
         goal_radius=goal_radius_of(problem, states),
     )
+
+
+def _with_risk(run: SolveRun, result: RunResult) -> str:
+    """The detail of an answer whose risk was too high: at which step, and which risk is not, if that can be told."""
+    work, risk, steps = run.work, run.problem.risk, run.problem.steps
+    if not np.isfinite(work.cost):
+        work.set_best(work.last)
+    if not np.isfinite(work.best.states).all():
+        return result.detail
+    failed = run.fails_at(risk)
+    if failed < 0 or run.fails_at(0.0) >= 0:
+        return result.detail
+    most = run.largest_risk(risk) * (1 - 1e-5)  # so that even the rounded number works
+    too_high = f"about the best plan a risk of {risk:g} is too high at step {failed} of {steps}"
+    too_high += f", and at most {most:.5g} will do"
+    return f"{too_high}; {result.detail}" if result.detail else too_high
 
 
 def parts_of(problem: Problem) -> dict[str, str]:

@@ -61,6 +61,7 @@ VALLEY, NEARLY, NEAR = 0.2, 1e-2, 0.1
 # The squares that the interior point's margins leave of a cost of zero, relative to those that rounding leaves.
 MARGIN_SQUARES = 1e8
 ROUNDING = 1e-9  # relative difference of costs below which two plans are equally good
+DIGITS = 1e-12  # relative accuracy of the largest risk
 
 
 @dataclass(frozen=True)
@@ -370,6 +371,14 @@ class SolveRun:
         *_, failed = self._loop(*self._linearize_arguments(np.full(1, np.nan, LOG)))
         self.work.model.noise.risk[0] = self.problem.risk
         return failed
+
+    def largest_risk(self, high: float) -> float:
+        """The largest risk with which a pass about the plan in memory does not fail, given one with which it does."""
+        low = 0.0
+        while high - low > DIGITS * high:
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self.fails_at(middle) < 0 else (low, middle)
+        return low
 
     # The results of a run.
 

@@ -26,7 +26,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory
 from lqrsim.solvers.budget import Budget, Laps, Stop
 from lqrsim.solvers.multistart import Way, ways
-from lqrsim.solvers.settings import InitialGuess, SmootherSettings, StartLike, resampled, resolve
+from lqrsim.solvers.settings import InitialGuess, SmootherSettings, resampled, resolve
 from lqrsim.solvers.stages import MEDIUM, STRONG, WEAK, Barrier, InteriorPoint, InteriorResult, Stages
 from lqrsim.solvers.tree import ways_by_trees
 
@@ -54,7 +54,7 @@ FELL = 1e-3  # relative decrease of cost, with the cost of time, for which a sea
 
 
 def solve_for_duration(
-    problem: Problem, settings: SmootherSettings, solve: Callable[[Problem, SmootherSettings], Solution], stop: Stop,
+    problem: Problem, settings: SmootherSettings, solve: Callable[..., Solution], stop: Stop,
     begin: Solution | None = None,
 ) -> Solution:  # fmt: skip
     """Find the best duration, and finish the plan with that duration.
@@ -67,8 +67,7 @@ def solve_for_duration(
     alone = begin is None and settings.start is None and settings.safeguard
     if alone:
         search.follow_ways()
-    if not (problem.segments and settings.start is not None and search.follow_start(settings.start)):
-        search.go_on_from(begin)
+    search.go_on_from(begin)
     if alone:
         search.grow_trees()
     if settings.safeguard:
@@ -80,9 +79,8 @@ class DurationSearch:
     """A search for the best duration, from one plan after another."""
 
     def __init__(
-        self, problem: Problem, settings: SmootherSettings, solve: Callable[[Problem, SmootherSettings], Solution],
-        stop: Stop,
-    ) -> None:  # fmt: skip
+        self, problem: Problem, settings: SmootherSettings, solve: Callable[..., Solution], stop: Stop
+    ) -> None:
         assert problem.duration is not None
         self._problem, self._settings, self._solve = problem, settings, solve
         self._range, self._stop = problem.duration, stop
@@ -185,14 +183,6 @@ class DurationSearch:
         cost = result.measures.cost if np.isfinite(result.measures.cost) else np.inf
         self.candidates.append(Candidate(name, cost, self._total - before, status, result.trajectory(ordinary.dt)))
 
-    def follow_start(self, start: StartLike | InitialGuess) -> bool:
-        """Go on from a trajectory of the caller, as it is, and return whether that led to a plan.
-
-        Its knots may be far from the best ends of segments, so a plan of the stated duration may be hard to find.
-        """
-        trajectory = resolve(start, self._problem).trajectory
-        return trajectory is not None and self._find(trajectory, self._budget)[0]
-
     def go_on_from(self, begin: Solution | None) -> None:
         """Go on from the solution for the stated duration; with a weight on time, also from those for shorter ones.
 
@@ -200,6 +190,12 @@ class DurationSearch:
         must do, for the others take long and are for problems of which no plan is known.
         """
         problem, settings = self._problem, self._settings
+        if problem.segments and settings.start is not None:
+            # A trajectory of the caller, as it is, may lead to a plan: its knots may be far from the best ends of
+            # segments, so that a plan of the stated duration is hard to find.
+            trajectory = resolve(settings.start, problem).trajectory
+            if trajectory is not None and self._find(trajectory, self._budget)[0]:
+                return
         by_ways, before = self.best, self._total
         if by_ways is not None:
             settings = replace(settings, safeguard=False)
@@ -249,17 +245,93 @@ class DurationSearch:
             begin = again.trajectory
 
     def _find(self, begin: Trajectory, budget: Budget, fraction: float = 1.0) -> tuple[bool, Problem, InteriorResult]:
-        """Find the best duration near a plan's: whether it is the cheapest so far, the problem with it, the plan."""
-        before, settings = len(budget.log), self._settings
+        """Find the best duration near a plan's. Whether it is the cheapest so far, the problem with it, and the optimum
+        or the last plan, whose cost includes the price of violations.
+
+        The iterations join the log of the budget, which may end the search.
+        """
+        before, problem, tolerance = len(budget.log), self._problem, fraction * self._settings.final(self._problem)
         budget.report()
         with self._stop.reporting("smooth"):
-            tolerance = fraction * settings.final(self._problem)
-            ordinary, result = find_duration(self._problem, begin, settings, budget, tolerance=tolerance)
+            by_segment = self._with_timed_segments(begin, budget) if problem.segments else None
+            held = by_segment is not None
+            if by_segment is not None:
+                problem, begin = by_segment
+            stages, prices, result = self._searched(problem, begin, budget, tolerance=tolerance, hold=held)
         self._total += len(budget.log) - before
+        n, cost = len(problem.dynamics.state_coordinates), result.measures.cost + _paid(stages, result.plan, prices)
+        ordinary = problem._of_duration(float(np.clip(result.plan.states[0, n], *self._range)))
+        # Remove everything that belongs to the duration.
+        rows = result.sizes.rows[stages.owners != len(problem.constraint_terms)]
+        result = replace(
+            result, plan=Motion(in_c_order(result.plan.states[:, :n]), result.plan.controls),
+            gain=in_c_order(result.gain[:, :, :n]), multipliers=result.multipliers[:-1],
+            measures=result.measures._replace(cost=cost), sizes=result.sizes._replace(rows=rows),
+        )  # fmt: skip
         cheaper = result.solved and (self.best is None or result.measures.cost < self.best[1].measures.cost)
         if cheaper:
             self.best, self._log = (ordinary, result), list(budget.log)
         return cheaper, ordinary, result
+
+    def _searched(
+        self, problem: Problem, begin: Trajectory, budget: Budget, *, tolerance: float, segments: Sequence[int] = (),
+        hold: bool = False,
+    ) -> tuple[Stages, Array, InteriorResult]:  # fmt: skip
+        """The optimum near a plan with its duration as a state, which jumps where segments end; and the price of rows.
+
+        With `hold`, the gaps of the plan are first closed with its duration, which must be that of the problem.
+        """
+        n, violation = len(problem.dynamics.state_coordinates), self._settings.violation_tolerance(problem)
+        with self._stop.not_counting():  # compiling
+            stages = Stages(with_duration_state(problem, by_segment=bool(segments)))
+        stages.about.jumps[list(segments)] = 1.0  # the last state may jump there, each after the first
+        laps = Laps(budget)
+        states = np.column_stack([begin.states, np.full(len(begin.states), begin.horizon)])
+        plan = Motion(in_c_order(states), in_c_order(begin.controls))
+        # The bounds of the duration hold at any price.
+        prices = np.where(stages.owners == len(problem.constraint_terms), np.inf, self._settings.price)
+
+        def run(
+            plan: Motion, barrier: Barrier, tolerance: float, multipliers: tuple[Array, ...] = ()
+        ) -> InteriorResult:
+            point = InteriorPoint(stages, plan, barrier, price=prices, multipliers=multipliers)
+            return point.run(
+                tolerance=tolerance, violation=violation, most=min(MOST, budget.left), hurried=budget.hurried,
+                laps=laps, over=lambda *_: self._stop.due,
+            )  # fmt: skip
+
+        held = None
+        if hold:
+            stages.free[n] = 0.0
+            held = run(plan, CLOSING, CLOSED)
+        stages.free[n] = 1.0
+        if held is not None and held.solved:
+            return stages, prices, run(held.plan, WEAK, tolerance, held.multipliers)
+        return stages, prices, run(plan, MEDIUM, tolerance)
+
+    def _with_timed_segments(self, begin: Trajectory, budget: Budget) -> tuple[Problem, Trajectory] | None:
+        """The problem with its segments at the knots where they end in time, and a plan with these, in equal steps.
+
+        The duration of both is a little longer than that of the segments together. None if no durations of the segments
+        are found; whether they are the best does not matter here.
+        """
+        problem = self._problem
+        _, _, result = self._searched(problem, begin, budget, tolerance=NEAR_SEGMENTS, segments=problem.segments)
+        allowed, measures = self._settings.violation_tolerance(problem), result.measures
+        if not (result.solved or (measures.violation <= allowed and measures.gap < NEAR_SEGMENTS)):
+            return None
+        steps, old = problem.steps, np.array([0, *problem.segments, problem.steps])
+        ends = np.cumsum([0.0, *result.plan.states[:-1, -1] / steps])  # times of the knots
+        new = np.rint(ends[old] / ends[-1] * steps).astype(int)
+        for k in range(1, len(new)):
+            new[k] = max(new[k], new[k - 1] + 2)  # `Problem` wants two steps in a segment
+        new[-1] = steps
+        for k in range(len(new) - 2, 0, -1):
+            new[k] = min(new[k], new[k + 1] - 2)
+        at = np.interp(np.arange(steps + 1), new, old)
+        plan = resampled(result.plan.states[:, :-1], result.plan.controls, at)
+        dt = float(np.clip(LONGER * ends[-1], *self._range)) / steps
+        return replace(problem._with_segments(new[1:-1].tolist()), dt=dt), Trajectory(*plan, dt)
 
     def _solved(self, fixed: Problem, settings: SmootherSettings) -> Solution:
         solution = self._solve(fixed, settings)
@@ -328,95 +400,6 @@ def _paid(stages: Stages, plan: Motion, price: float | Array) -> float:
     prices, numbers = np.where(np.isfinite(price) & (stages.owners >= 0), price, 0.0), stages.values(plan)
     missed = np.where(stages.equality, np.abs(numbers), np.maximum(-numbers, 0.0))[stages.live]
     return float((np.broadcast_to(prices, numbers.shape)[stages.live] * missed).sum())
-
-
-def find_duration(
-    problem: Problem, begin: Trajectory, settings: SmootherSettings, budget: Budget, *, tolerance: float
-) -> tuple[Problem, InteriorResult]:
-    """Find the best duration near a plan's duration. Return the problem with it, and the optimum or the last plan.
-
-    The iterations join the log of the budget, which may end the search. The cost includes the price of violations.
-    """
-    assert problem.duration is not None
-    low, high = problem.duration
-    by_segment = _with_timed_segments(problem, begin, settings, budget) if problem.segments else None
-    if by_segment is not None:
-        problem, begin = by_segment
-    n = len(problem.dynamics.state_coordinates)
-    held = by_segment is not None
-    stages, prices, result = _searched(problem, begin, settings, budget, tolerance=tolerance, hold=held)
-    cost = result.measures.cost + _paid(stages, result.plan, prices)
-    duration = float(np.clip(result.plan.states[0, n], low, high))
-    # Remove everything that belongs to the duration.
-    rows = result.sizes.rows[stages.owners != len(problem.constraint_terms)]
-    result = replace(
-        result, plan=Motion(in_c_order(result.plan.states[:, :n]), result.plan.controls),
-        gain=in_c_order(result.gain[:, :, :n]), multipliers=result.multipliers[:-1],
-        measures=result.measures._replace(cost=cost), sizes=result.sizes._replace(rows=rows),
-    )  # fmt: skip
-    return problem._of_duration(duration), result
-
-
-def _searched(
-    problem: Problem, begin: Trajectory, settings: SmootherSettings, budget: Budget, *, tolerance: float,
-    segments: Sequence[int] = (), hold: bool = False,
-) -> tuple[Stages, Array, InteriorResult]:  # fmt: skip
-    """The optimum near a plan with its duration as a state, which jumps where segments end; and the price of rows.
-
-    With `hold`, the gaps of the plan are first closed with its duration, which must be that of the problem.
-    """
-    n, violation = len(problem.dynamics.state_coordinates), settings.violation_tolerance(problem)
-    with budget.stop.not_counting():  # compiling
-        stages = Stages(with_duration_state(problem, by_segment=bool(segments)))
-    stages.jump(segments)
-    laps = Laps(budget)
-    states = np.column_stack([begin.states, np.full(len(begin.states), begin.horizon)])
-    plan = Motion(in_c_order(states), in_c_order(begin.controls))
-    # The bounds of the duration hold at any price.
-    prices = np.where(stages.owners == len(problem.constraint_terms), np.inf, settings.price)
-
-    def run(plan: Motion, barrier: Barrier, tolerance: float, multipliers: tuple[Array, ...] = ()) -> InteriorResult:
-        point = InteriorPoint(stages, plan, barrier, price=prices, multipliers=multipliers)
-        return point.run(
-            tolerance=tolerance, violation=violation, most=min(MOST, budget.left), hurried=budget.hurried,
-            laps=laps, over=lambda *_: budget.stop.due,
-        )  # fmt: skip
-
-    held = None
-    if hold:
-        stages.free[n] = 0.0
-        held = run(plan, CLOSING, CLOSED)
-    stages.free[n] = 1.0
-    if held is not None and held.solved:
-        return stages, prices, run(held.plan, WEAK, tolerance, held.multipliers)
-    return stages, prices, run(plan, MEDIUM, tolerance)
-
-
-def _with_timed_segments(
-    problem: Problem, begin: Trajectory, settings: SmootherSettings, budget: Budget
-) -> tuple[Problem, Trajectory] | None:
-    """The problem with its segments at the knots where they end in time, and a plan with these, in equal steps.
-
-    The duration of both is a little longer than that of the segments together. None if no durations of the segments are
-    found; whether they are the best does not matter here.
-    """
-    assert problem.duration is not None
-    _, _, result = _searched(problem, begin, settings, budget, tolerance=NEAR_SEGMENTS, segments=problem.segments)
-    allowed, measures = settings.violation_tolerance(problem), result.measures
-    if not (result.solved or (measures.violation <= allowed and measures.gap < NEAR_SEGMENTS)):
-        return None
-    steps, old = problem.steps, np.array([0, *problem.segments, problem.steps])
-    ends = np.cumsum([0.0, *result.plan.states[:-1, -1] / steps])  # times of the knots
-    new = np.rint(ends[old] / ends[-1] * steps).astype(int)
-    for k in range(1, len(new)):
-        new[k] = max(new[k], new[k - 1] + 2)  # `Problem` wants two steps in a segment
-    new[-1] = steps
-    for k in range(len(new) - 2, 0, -1):
-        new[k] = min(new[k], new[k + 1] - 2)
-    at = np.interp(np.arange(steps + 1), new, old)
-    plan = resampled(result.plan.states[:, :-1], result.plan.controls, at)
-    dt = float(np.clip(LONGER * ends[-1], *problem.duration)) / steps
-    return replace(problem._with_segments(new[1:-1].tolist()), dt=dt), Trajectory(*plan, dt)
 
 
 def with_duration_state(problem: Problem, *, by_segment: bool = False) -> Problem:

@@ -12,10 +12,9 @@ from lqrsim.problem.problem import Problem
 from lqrsim.results.solution import Solution
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Budget
-from lqrsim.solvers.engine import RunResult, SolveRun
+from lqrsim.solvers.engine import SolveRun
 from lqrsim.solvers.settings import SmootherSettings, resolve
 
-DIGITS = 1e-12  # relative accuracy of the bisection
 MOST_TRIALS = 10_000_000
 
 
@@ -90,29 +89,4 @@ def largest_risk(problem: Problem, solution: Solution) -> float:
         high *= 2
         if high > 1e200:
             return float("inf")
-    return _bisect(run, high)
-
-
-def name_risk(run: SolveRun, result: RunResult) -> str:
-    """The detail of an answer whose risk was too high: at which step, and which risk is not, if that can be told."""
-    work, risk, steps = run.work, run.problem.risk, run.problem.steps
-    if not np.isfinite(work.cost):
-        work.set_best(work.last)
-    if not np.isfinite(work.best.states).all():
-        return result.detail
-    failed = run.fails_at(risk)
-    if failed < 0 or run.fails_at(0.0) >= 0:
-        return result.detail
-    most = _bisect(run, risk) * (1 - 1e-5)  # so that even the rounded number works
-    too_high = f"about the best plan a risk of {risk:g} is too high at step {failed} of {steps}"
-    too_high += f", and at most {most:.5g} will do"
-    return f"{too_high}; {result.detail}" if result.detail else too_high
-
-
-def _bisect(run: SolveRun, high: float) -> float:
-    """The largest risk with which a pass about the plan of a run does not fail, given one above it."""
-    low = 0.0
-    while high - low > DIGITS * high:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if run.fails_at(middle) < 0 else (low, middle)
-    return low
+    return run.largest_risk(high)

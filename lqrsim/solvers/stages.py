@@ -153,10 +153,6 @@ class Stages:
         if margin is not None:
             self._targets[...] = np.where(limit | self.equality, 0.0, margin)
 
-    def jump(self, knots: Sequence[int]) -> None:
-        """Let the last state jump at some knots, each after the first."""
-        self.about.jumps[list(knots)] = 1.0
-
     @classmethod
     def lent(cls, problem: Problem) -> "Stages":
         """The stages of a problem, if possible in memory that was given back."""
