@@ -1,5 +1,6 @@
 """Makes a `Solution` from the result of a run, and says what is doubtful about its plan."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from copy import deepcopy
@@ -308,17 +309,14 @@ def remedy_of(
     if status is Status.INFEASIBLE and result.against:
         relaxed = f"relax {result.against[0].rsplit(' at ', 1)[0]}"
         return f"allow more time than {problem.dt * problem.steps:g} s, {relaxed}, or ask for less of what is missed"
-    if status is Status.NOT_POSITIVE_DEFINITE and (flat := _flat_controls(problem, result)):
-        return f"the cost is not curved in {', '.join(flat)}: give control_limits, or add a ControlCost"
+    if status is Status.NOT_POSITIVE_DEFINITE:  # for one, where the stage cost is not curved at the first step
+        stage = compiled.compile_problem(problem).stage
+        _, _, hessian = compiled.quadratic_at(problem, stage, result.states[0], result.controls[0], 0)
+        curved = np.diag(hessian)[result.states.shape[1] :] > 0
+        if not curved.all():
+            flat = ", ".join(itertools.compress(space.names, ~curved))
+            return f"the cost is not curved in {flat}: give control_limits, or add a ControlCost"
     return status.remedy
-
-
-def _flat_controls(problem: Problem, result: RunResult) -> list[str]:
-    """The controls in which the stage cost is not curved at the first step of a plan."""
-    n, names = result.states.shape[1], problem.control_coordinates.names
-    stage = compiled.compile_problem(problem).stage
-    _, _, hessian = compiled.quadratic_at(problem, stage, result.states[0], result.controls[0], 0)
-    return [name for name, curved in zip(names, np.diag(hessian)[n:] > 0, strict=True) if not curved]
 
 
 def goal_radius_of(problem: Problem, plan: Array | None = None) -> float | None:

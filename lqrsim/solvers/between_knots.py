@@ -108,10 +108,13 @@ def _violations(problem: Problem, plan: Motion) -> tuple[list[Array], list[Array
     A start that violates a row, and so cannot be helped, leaves out the first period.
     """
     terms = problem.constraint_terms
-    within = [
-        not (term.equality or term.final_only or _moves(constraint))
-        for constraint, term in zip(problem.constraints, terms, strict=True)
-    ]
+    within = []
+    for constraint, term in zip(problem.constraints, terms, strict=True):
+        obstacles = constraint.kept_clear
+        # It is known at the knots only with obstacles that move, whatever its margins, or with the time.
+        moving = obstacles is not None and obstacles.world.moving
+        moving = moving or (constraint.moving and not constraint.by_knot)
+        within.append(not (term.equality or term.final_only or moving))
     if not any(within):
         none: list[Array] = [np.zeros((problem.steps, term.rows)) for term in terms]
         return none, none
@@ -125,13 +128,6 @@ def _violations(problem: Problem, plan: Motion) -> tuple[list[Array], list[Array
         worst.append(missed if checked else np.zeros_like(missed))
         times.append(time)
     return worst, times
-
-
-def _moves(constraint: Constraint) -> bool:
-    """Whether it is known at the knots only: with obstacles that move, whatever its margins, or with the time."""
-    obstacles = constraint.kept_clear
-    moving = obstacles is not None and obstacles.world.moving
-    return moving or (constraint.moving and not constraint.by_knot)
 
 
 def _values(problem: Problem, states: Array, controls: Array) -> list[Array]:

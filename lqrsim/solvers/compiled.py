@@ -131,25 +131,16 @@ def _constraint_functions(constraints: tuple[tuple[Source, int, bool, bool], ...
     return np.array(rows, dtype=np.float64).reshape(-1, 5)
 
 
-def _noise_module(problem: Problem, term: NoiseTerm) -> CompiledModule:
+def noise_module(problem: Problem, term: NoiseTerm) -> CompiledModule:
+    """The compiled noise of a problem; see `kernels/noise.py`."""
     return module_of(term.code, "noise", **_sizes(problem.dynamics))
 
 
 def _noise(problem: Problem, term: NoiseTerm) -> NoiseModel:
-    value, quadratic = _noise_module(problem, term).addresses("noise_value", "noise_quadratic")
+    value, quadratic = noise_module(problem, term).addresses("noise_value", "noise_quadratic")
     n = len(problem.dynamics.state_coordinates)
     hessian, gradient = np.zeros((problem.steps + 1, n, n)), np.zeros((problem.steps + 1, n))
     return NoiseModel(value, quadratic, numbers_of(term), np.array([problem.risk, 0.0, 0.0]), hessian, gradient)
-
-
-def noisy_costs(problem: Problem, start: Array, policy: Policy, draws: Array) -> Array:
-    """Costs (K,) of runs of a policy from a state (n,), with noise samples (K, T, size)."""
-    assert problem.noise_term is not None
-    costs, steps = np.empty(len(draws)), problem.steps
-    flat = draws.reshape(-1, draws.shape[2])
-    module = _noise_module(problem, problem.noise_term)
-    module.noisy_costs(len(draws), steps, start, policy, compile_problem(problem), flat, costs)
-    return costs
 
 
 def costs_module(problem: Problem) -> CompiledModule:

@@ -13,6 +13,7 @@ value functions. Any other plan is rolled out.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -193,7 +194,11 @@ class InteriorRun:
         self.idle = self._is_idle(interior)
         if interior.solved and (result := self._polished(interior)) is not None and result.success:
             return result
-        result = self._rolled_out(interior.plan, interior.gain)
+        # The rollout with gains about the plan, or without gains if this violates the constraints less.
+        plan, gain = interior.plan, interior.gain
+        laws = [compiled.law_about(*plan, gains) for gains in (gain.copy(), np.zeros_like(gain))]
+        candidates = (self.result(self._run.work.roll_out(law, plan.states[0]), law) for law in laws)
+        result = min(candidates, key=lambda result: (not np.isfinite(result.cost), result.violation, result.cost))
         if not interior.flat or result.violation > self._allowed:
             return result
         detail = KINKED if self._jumps(interior) else ""
@@ -247,12 +252,6 @@ class InteriorRun:
     def without_multipliers(self) -> None:
         for multipliers in self._run.work.multipliers:
             multipliers.penalty, multipliers.values[...] = 0.0, 0.0
-
-    def _rolled_out(self, plan: Motion, gain: Array) -> RunResult:
-        """The rollout of a plan with gains about it, or without gains if this violates the constraints less."""
-        laws = [compiled.law_about(*plan, gains) for gains in (gain.copy(), np.zeros_like(gain))]
-        candidates = (self.result(self._run.work.roll_out(law, plan.states[0]), law) for law in laws)
-        return min(candidates, key=lambda result: (not np.isfinite(result.cost), result.violation, result.cost))
 
     def _polished(self, interior: InteriorResult) -> RunResult | None:
         """Finish a converged plan by Newton's method; None if its rollout is not finite."""
@@ -457,16 +456,16 @@ class ConstrainedRun(InteriorRun):
             return self._remember(result)
         bottom = copied(result) if result.success else self._smoothed
         run.go_on(checkpoint)
-        if self._budget.stop.due or (self._guided and self._cuts(bottom)):
-            return None  # deep in an obstacle, the interior point stalls, but the augmented Lagrangian method moves out
-        return self._interior(bottom, WEAK if self._guided else STRONG)
-
-    def _cuts(self, plan: Motion) -> bool:
-        """Whether a plan misses a constraint by more than `DEEP` of the row's typical size."""
-        stages = self._run.stages
-        sizes, numbers = stages.sizes(plan).rows, stages.values(plan)
+        if self._budget.stop.due:
+            return None
+        if not self._guided:
+            return self._interior(bottom, STRONG)
+        stages = run.stages
+        sizes, numbers = stages.sizes(bottom).rows, stages.values(bottom)
         missed = np.where(stages.equality, np.abs(numbers), -numbers) / sizes
-        return bool((missed[stages.live & (stages.owners >= 0)] > DEEP).any())
+        if (missed[stages.live & (stages.owners >= 0)] > DEEP).any():
+            return None  # deep in an obstacle, the interior point stalls, but the augmented Lagrangian method moves out
+        return self._interior(bottom, WEAK)
 
     def _from_start(self) -> RunResult | None:
         self._untried = False
@@ -500,6 +499,14 @@ class ConstrainedRun(InteriorRun):
         tried before the next price.
         """
         run, budget = self._run, self._budget
+
+        def is_stationary(plan: Motion, shares: list[Array], sizes: Sizes) -> bool:
+            """Whether the violation of a plan is; if so, the plan is kept as evidence."""
+            result = self.result(plan)
+            new = evidence(run, result, shares, sizes) if result.violation > EVIDENT * self._allowed else None
+            self._known.evidence += [] if new is None else [new]
+            return new is not None
+
         for price in PRICES:
             sizes, priced = run.stages.sizes(plan), None
             if self._known.rows is None:
@@ -511,7 +518,7 @@ class ConstrainedRun(InteriorRun):
                 priced = restore(
                     run.stages, plan, sizes, price=price, most=min(RESTORED, budget.left - 1), laps=Laps(budget),
                     over=lambda: budget.stop.due, hurried=budget.hurried,
-                    stationary=lambda plan, shares, sizes=sizes: self._keep_evidence(plan, shares, sizes),
+                    stationary=partial(is_stationary, sizes=sizes),
                 )  # fmt: skip
             if priced is None:
                 return None
@@ -528,16 +535,6 @@ class ConstrainedRun(InteriorRun):
             if result is not None and result.success:
                 return result
         return None
-
-    def _keep_evidence(self, plan: Motion, shares: list[Array], sizes: Sizes) -> bool:
-        """Whether the violation of a plan is stationary; if so, the plan is kept as evidence."""
-        result = self.result(plan)
-        if not result.violation > EVIDENT * self._allowed:
-            return False
-        new_evidence = evidence(self._run, result, shares, sizes)
-        if new_evidence is not None:
-            self._known.evidence.append(new_evidence)
-        return new_evidence is not None
 
     def _interior(
         self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = (), stale: int | None = None

@@ -54,8 +54,10 @@ def sample_costs(
         stream = np.random.SeedSequence(seed, spawn_key=(trial,))
         draws[trial] = np.random.Generator(np.random.SFC64(stream)).standard_normal((problem.steps, size))
     policy = Policy(in_c_order(solution.policy.gain), in_c_order(solution.policy.offset))
-    start = solution.trajectory.states[0].copy()
-    return compiled.noisy_costs(problem, start, policy, draws)
+    start, flat, costs = solution.trajectory.states[0].copy(), draws.reshape(-1, size), np.empty(trials)
+    module, model = compiled.noise_module(problem, problem.noise_term), compiled.compile_problem(problem)
+    module.noisy_costs(trials, problem.steps, start, policy, model, flat, costs)
+    return costs
 
 
 @checked

@@ -126,7 +126,7 @@ class Search:
             self.choose_start()
             if trees and self.may_go_on and self.is_barred:
                 self.grow_trees()
-            if self._settings.start is None and self._exact and not self._guided and self.touches_passable:
+            if self._settings.start is None and self._exact and not self._guided:
                 self.try_detours()
             self.leave_saddles()  # while the best plan is one
         if self._default and self.may_go_on and self._unmoved():
@@ -141,7 +141,7 @@ class Search:
             self.keep_given(given)
         if not self.best[1].success and self.may_go_on:
             self.alternate_softness()
-        if not self.best[1].success and self.has_cheaper_beside and self.may_go_on:
+        if not self.best[1].success and self.may_go_on:
             self.leave_contact_modes()
 
     def choose_start(self) -> tuple[SolveRun, RunResult]:
@@ -321,14 +321,11 @@ class Search:
         self._offer(chosen, result, better=result.violation <= best.violation and result.cost < best.cost)
         self.tried = not self._stop.due
 
-    @property
-    def touches_passable(self) -> bool:
-        """Whether the best plan touches a constraint that may be passed on another side."""
-        touched = itertools.compress(self.best[1].multipliers, passable(self._problem))
-        return any(multipliers.values.any() for multipliers in touched)
-
     def try_detours(self) -> None:
-        """Finish plans from paths to the sides."""
+        """If the best plan touches a constraint that may be passed on another side, finish plans from such paths."""
+        touched = itertools.compress(self.best[1].multipliers, passable(self._problem))
+        if not any(multipliers.values.any() for multipliers in touched):
+            return
         tried = {name for name, _ in self._named}
         for name, trajectory in multistart.detours(self._problem, self._settings.starts).items():
             if name not in tried and not self._stop.due:
@@ -544,16 +541,13 @@ class Search:
             if not optimum.cost < before.cost - FELL * abs(before.cost):
                 return
 
-    @property
-    def has_cheaper_beside(self) -> bool:
-        """Whether the best plan ended within its contact modes, and a plan beside it, out of them, is cheaper."""
+    def leave_contact_modes(self) -> None:
+        """If the best plan ended within its contact modes, and one beside it is cheaper, descend out of them."""
         run, best = self.best
         contacts = None if best.certificate is None else best.certificate.contacts
-        return contacts is not None and max(contacts.across, contacts.sampled) > run.final
-
-    def leave_contact_modes(self) -> None:
-        """Descend from the best plan, out of its contact modes."""
-        run = self._add(guess_from(self.best[1], "the best plan"), "the best plan, out of its contact modes")
+        if contacts is None or not max(contacts.across, contacts.sampled) > run.final:
+            return
+        run = self._add(guess_from(best, "the best plan"), "the best plan, out of its contact modes")
         result = self._finish(run, refine, most=SOFT)
         self._offer(run, result, better=self._is_better(result))
 
@@ -768,11 +762,13 @@ class Search:
         deeper than half the radius, or half the radius of the largest collision sphere. Without an ObstacleCost, a plan
         is unacceptable if it violates the constraints, or does nothing.
         """
-        problem = self._problem
-        space = problem.dynamics.state_coordinates
+        problem, space, (run, best) = self._problem, self._problem.dynamics.state_coordinates, self.best
         if not self._guided or problem.goal is None:
-            return self.is_without_plan or self._idle()
-        (run, best), radius = self.best, max(cost.radius for cost in problem.obstacle_costs)
+            # It does nothing where no single control helps from rest, but several together would.
+            nominal = problem.nominal_controls
+            idle = np.abs(best.controls - nominal).max() <= IDLE * max(1.0, np.abs(nominal).max())
+            return self.is_without_plan or (best.success and best.cost > run.work.memory["negligible"] and idle)
+        radius = max(cost.radius for cost in problem.obstacle_costs)
         if not best.success:
             return run.budget.left > 0
         if space.position:
@@ -784,13 +780,6 @@ class Search:
             return True
         clearance = clearance_of(problem, best.states)
         return clearance is not None and not clearance.min() >= -0.5 * radius
-
-    def _idle(self) -> bool:
-        """Whether the best plan does nothing, as when no single control helps from rest, but several together would."""
-        (run, best), nominal = self.best, self._problem.nominal_controls
-        off = np.abs(best.controls - nominal).max()
-        costs = best.cost > run.work.memory["negligible"]
-        return best.success and costs and off <= IDLE * max(1.0, np.abs(nominal).max())
 
     @property
     def is_without_plan(self) -> bool:
