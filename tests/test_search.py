@@ -17,6 +17,7 @@ from lqrsim.errors import Array
 from lqrsim.results.solution_parts import Iteration, Status
 from lqrsim.solvers import strategy
 from lqrsim.solvers.multistart import bends, guides, path, reweighted
+from lqrsim.solvers.stages import Stages
 
 STARTS = ["straight", *(f"{far} m to the {side}" for far in (1, 2, 3) for side in ("left", "right"))]
 
@@ -477,3 +478,21 @@ def test_a_callback_hears_of_what_is_run_to_its_end_alone_and_in_the_callers_thr
     assert len(solution.candidates) == 2
     assert {thread for _, thread in told} == {threading.get_ident()}
     assert len(told) == sum(one.iterations for one in solution.candidates)
+
+
+@pytest.mark.parametrize("far", [5.0, 9.0])
+def test_memory_that_was_given_back_is_not_used_again(monkeypatch: pytest.MonkeyPatch, far: float) -> None:
+    """Another solve, in another thread, may have it. A goal out of reach, past an obstacle, takes all attempts."""
+    problem = in_the_plane(
+        constraints=[ls.GoalState(x=far)], final_cost=ls.QuadraticCost([100.0, 100.0, 1.0], about=[far, 0.0, 0.0])
+    )
+    found, used = ls.smooth(problem), list[Stages]()
+    assert found.status is Status.INFEASIBLE
+
+    def give_back(stages: Stages) -> None:
+        monkeypatch.setattr(stages, "call", lambda *_: used.append(stages))
+        monkeypatch.setattr(stages, "sizes", lambda *_: used.append(stages))
+
+    monkeypatch.setattr(Stages, "give_back", give_back)
+    assert same(ls.smooth(problem), found)
+    assert used == []

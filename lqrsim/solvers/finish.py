@@ -357,6 +357,7 @@ class ConstrainedRun(InteriorRun):
     def run_to_end(self) -> RunResult:
         """Make the attempts in turn, until one converges to a plan that is no worse than a given one."""
         for result in self._attempts():
+            self._remember(result)
             if result is not None and result.success:
                 if not self._worse(result):
                     break
@@ -370,11 +371,11 @@ class ConstrainedRun(InteriorRun):
         run, budget, start, hard = self._run, self._budget, self._start, not self._elastic
         from_start, multipliers = self._untried, tuple(record.values for record in self._guess.multipliers)
         if self._guess.interior is not None:  # of the search for a free duration: it is only finished
-            yield self._remember(self.finished(self._guess.interior))
+            yield self.finished(self._guess.interior)
         if budget.over:
             return
         if any(values.any() for values in multipliers):  # the plan of another solution, with its multipliers
-            yield self._interior(copied(start), WEAK, multipliers=multipliers)
+            yield self.run_from(copied(start), WEAK, multipliers=multipliers)
         if self._stay and self._guided:
             with budget.limited(REFINED):
                 result = damped_to_end(run)
@@ -399,7 +400,7 @@ class ConstrainedRun(InteriorRun):
         if hard and not (self._converged or self._curved):
             self.without_multipliers()
             result = by_multipliers(run)
-            yield self._remember(result if result.success else None)
+            yield result if result.success else None
         if not self._converged:
             yield self._from_best_without_constraints()
 
@@ -412,7 +413,7 @@ class ConstrainedRun(InteriorRun):
         begin = self._guess.trajectory or self._start
         near = self._start.violation <= self._allowed and np.allclose(begin.states, self._start.states)
         self._untried &= near or not np.array_equal(begin.states, self._start.states)
-        return self._interior(copied(begin), WEAK if near else STRONG)
+        return self.run_from(copied(begin), WEAK if near else STRONG)
 
     def _from_best_without_constraints(self) -> RunResult | None:
         """From the best plan, by Newton's method without the constraints: they may not act at the optimum.
@@ -430,7 +431,7 @@ class ConstrainedRun(InteriorRun):
         if not result.success or result.violation > 0:
             run.final = tolerance
             return None
-        return self._remember(replace(result, multipliers=()))
+        return replace(result, multipliers=())
 
     def _from_valley(self) -> RunResult | None:
         run = self._run
@@ -444,32 +445,32 @@ class ConstrainedRun(InteriorRun):
         if self._budget.stop.due:
             return None
         if ending.success and not self._budget.log[-1].violation:
-            return self._remember(run.result(ending))
+            return run.result(ending)
         if ending.outcome != declarations.IN_VALLEY or (not self._guided and self._budget.log[-1].violation):
             # If the augmented Lagrangian method follows, it does better than an interior point that lacks curvature.
-            return self._interior(self._smoothed, STRONG, stale=TROUBLED if self._guided and not self._curved else None)
+            return self.run_from(self._smoothed, STRONG, stale=TROUBLED if self._guided and not self._curved else None)
         # If the optimum without constraints keeps them, it is the answer; with an ObstacleCost it is next to the
         # answer.
         checkpoint = run.checkpoint()
         result = run.newton()
         if result.success and result.violation == 0:
-            return self._remember(result)
+            return result
         bottom = copied(result) if result.success else self._smoothed
         run.go_on(checkpoint)
         if self._budget.stop.due:
             return None
         if not self._guided:
-            return self._interior(bottom, STRONG)
+            return self.run_from(bottom, STRONG)
         stages = run.stages
         sizes, numbers = stages.sizes(bottom).rows, stages.values(bottom)
         missed = np.where(stages.equality, np.abs(numbers), -numbers) / sizes
         if (missed[stages.live & (stages.owners >= 0)] > DEEP).any():
             return None  # deep in an obstacle, the interior point stalls, but the augmented Lagrangian method moves out
-        return self._interior(bottom, WEAK)
+        return self.run_from(bottom, WEAK)
 
     def _from_start(self) -> RunResult | None:
         self._untried = False
-        return self._interior(copied(self._start), STRONG)
+        return self.run_from(copied(self._start), STRONG)
 
     def _from_multipliers(self) -> RunResult | None:
         """From the plan of the augmented Lagrangian, which stays near the local optimum that smoothing has chosen.
@@ -480,7 +481,7 @@ class ConstrainedRun(InteriorRun):
         with self._budget.limited(AUGMENTED):
             result = meet_constraints(run, run.result(run.ending), stale=STALE)
         if result.success and not self._curved:
-            return self._remember(run.certified(result))
+            return run.certified(result)
         return self._after_multipliers(result, most=self._start.cost)
 
     def _after_multipliers(self, result: RunResult, *, most: float = np.inf) -> RunResult | None:
@@ -490,7 +491,7 @@ class ConstrainedRun(InteriorRun):
         usable = np.isfinite(result.cost) and result.cost <= most and np.isfinite(plan.states).all()
         if self._budget.stop.due or not usable:
             return None
-        return self._interior(plan, WEAK)
+        return self.run_from(plan, WEAK)
 
     def _at_a_price(self, plan: Motion) -> RunResult | None:
         """From the plan of a descent in which constraints may be violated at a price.
@@ -527,7 +528,7 @@ class ConstrainedRun(InteriorRun):
             if priced.stationary:
                 return None
             if priced.near or price == PRICES[-1]:
-                result = self._interior(plan, STRONG)
+                result = self.run_from(plan, STRONG)
             elif self._untried and self._start.violation <= self._allowed:
                 result = self._from_start()
             else:
@@ -536,10 +537,8 @@ class ConstrainedRun(InteriorRun):
                 return result
         return None
 
-    def _interior(
-        self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = (), stale: int | None = None
-    ) -> RunResult | None:
-        return self._remember(self.run_from(plan, barrier, multipliers=multipliers, stale=stale))
+    def finished(self, interior: InteriorResult) -> RunResult | None:
+        return self._remember(super().finished(interior))
 
     def _remember(self, result: RunResult | None) -> RunResult | None:
         if result is not None and (self._best is None or result.rank < self._best.rank):

@@ -634,13 +634,9 @@ class Search:
 
     def _unfinished(self, run: SolveRun, result: RunResult) -> str:
         """That another plan costs less and has not converged, and how to go on from it; empty for an unnamed one."""
-        for name, other in self._named:
-            if other is run:
-                return (
-                    f"a plan that has not converged keeps the constraints and costs less, {result.cost:.6g}:"
-                    f" the trajectory of candidate {name!r}, a start to go on from"
-                )
-        return ""
+        less = f"a plan that has not converged keeps the constraints and costs less, {result.cost:.6g}"
+        names = (name for name, other in self._named if other is run)
+        return next((f"{less}: the trajectory of candidate {name!r}, a start to go on from" for name in names), "")
 
     def _with_unmoved_states(self, result: RunResult) -> RunResult:
         """The result with the states that miss their goal and that no control changes; STALLED if others would."""
