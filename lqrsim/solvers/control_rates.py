@@ -16,7 +16,6 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from lqrsim.annotations import checked
 from lqrsim.errors import Array, InputError
@@ -25,13 +24,13 @@ from lqrsim.problem.control_rate import with_last_command
 from lqrsim.problem.problem import Problem
 from lqrsim.problem.quadratic_cost import ControlCost
 from lqrsim.results.policy import AffinePolicy, OutputFeedbackPolicy
-from lqrsim.results.solution import Plan, Replan, Solution
+from lqrsim.results.solution import Replan, Solution
 from lqrsim.results.solution_parts import Multipliers, Quadratic, Trajectory
 from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import clearance_of, parts_of
 from lqrsim.solvers.budget import Budget
 from lqrsim.solvers.engine import SolveRun
-from lqrsim.solvers.settings import InitialGuess, InitialPrior, Settings, SmootherSettings, is_function, resolve
+from lqrsim.solvers.settings import InitialGuess, InitialPrior, Settings, SmootherSettings, resolve
 
 P = TypeVar("P", Solution, Replan)
 S = TypeVar("S", bound=Settings)
@@ -40,7 +39,8 @@ S = TypeVar("S", bound=Settings)
 def solve_with_rates(problem: Problem, settings: S, solve: Callable[[Problem, S], Solution]) -> Solution:
     """Solve a problem with a `control_rate`; `solve` is for problems without."""
     wide = with_last_command(problem)
-    solution = solve(wide, replace(settings, start=widened(settings.start, problem, wide)))
+    guess = None if settings.start is None else widened(resolve(settings.start, problem), problem, wide)
+    solution = solve(wide, replace(settings, start=guess))
     policy, cost_to_go = feedback(problem, solution.trajectory, solution.multipliers)
     states = solution.trajectory.states[:, : len(problem.dynamics.state_coordinates)]
     return narrowed(
@@ -123,10 +123,10 @@ def rate_feedback(problem: Problem, solution: Solution) -> OutputFeedbackPolicy:
     if solution.problem_digest != problem.digest:
         raise InputError("solution: got that of another problem, want that of this one")
     wide, plan, n = with_last_command(problem), solution.trajectory, len(problem.dynamics.state_coordinates)
-    states = _with_commands(plan.states, plan.controls)
+    states = with_commands(plan).states
     if rate.previous is not None:
         states[0, n:] = np.asarray(rate.previous)
-    multipliers = widened(solution, problem, wide).multipliers
+    multipliers = widened(resolve(solution, problem), problem, wide).multipliers
     gain, cost_to_go = _gains(wide, states, plan.controls, multipliers) if plan.finite else (np.zeros(0), None)
     if cost_to_go is None:
         raise InputError(f"solution: got a plan without feedback ({solution.status.name}), want one that converged")
@@ -168,48 +168,26 @@ def bounding_cost(problem: Problem, controls: Array) -> ControlCost:
     return ControlCost(np.ones(m))._with(matrices, about)
 
 
-def widened(start: Any, problem: Problem, wide: Problem) -> Any:
+def widened(guess: InitialGuess, problem: Problem, wide: Problem) -> InitialGuess:
     """A start of the problem as one of the problem with the last command."""
-    if is_function(start):
-        start = start(problem)
-    if isinstance(start, InitialPrior | Trajectory | AffinePolicy | Plan):
-        resolve(start, problem)  # refuses other shapes as those of the problem
-    m = len(problem.control_coordinates)
-
-    def with_commands(plan: Trajectory) -> Trajectory:
-        return replace(plan, states=_with_commands(plan.states, plan.controls))
-
-    match start:
-        case InitialPrior():
-            padded = [(0, 0)] * (start.about.ndim - 1) + [(0, m)]
-            return InitialPrior(
-                np.pad(start.weight, (0, m)), about=np.pad(start.about, padded), iterations=start.iterations,
-                obstacles=start.obstacles, controls=start.controls,
-            )  # fmt: skip
-        case Trajectory():
-            return with_commands(start)
-        case AffinePolicy():
-            nominal = start.control_coordinates.clip(np.einsum("tij,tj->ti", start.gain, start.nominal) + start.offset)
-            return replace(
-                start, gain=np.pad(start.gain, [(0, 0), (0, 0), (0, m)]),
-                nominal=_with_commands(start.nominal, nominal[:-1]), state_coordinates=wide.dynamics.state_coordinates,
-            )  # fmt: skip
-        case InitialGuess():  # of a re-plan
-            return replace(start, gain=np.pad(start.gain, [(0, 0), (0, 0), (0, m)]), cost_to_go=None, multipliers=())
-        case Plan():
-            rows = [term.rows for term in wide.constraint_terms[len(start.multipliers) :]] if start.multipliers else []
-            zeros = (Multipliers(np.zeros((start.trajectory.steps + 1, count)), 0.0) for count in rows)
-            goal = None if start.goal is None else np.pad(start.goal, (0, m), constant_values=np.nan)
-            return Plan(
-                status=start.status, detail=start.detail, policy=widened(start.policy, problem, wide),
-                trajectory=with_commands(start.trajectory), cost_to_go=None,
-                multipliers=(*start.multipliers, *zeros), goal=goal,
-            )  # fmt: skip
-        case _:
-            return start
+    m, prior, trajectory = len(problem.control_coordinates), guess.prior, guess.trajectory
+    if prior is not None:
+        padded = [(0, 0)] * (prior.about.ndim - 1) + [(0, m)]
+        prior = InitialPrior(
+            np.pad(prior.weight, (0, m)), about=np.pad(prior.about, padded), iterations=prior.iterations,
+            obstacles=prior.obstacles, controls=prior.controls,
+        )  # fmt: skip
+    if trajectory is not None:
+        trajectory = with_commands(trajectory)
+    rows = [term.rows for term in wide.constraint_terms[len(guess.multipliers) :]] if guess.multipliers else []
+    others = (Multipliers(np.zeros((wide.steps + 1, count)), 0.0) for count in rows)
+    return replace(
+        guess, gain=np.pad(guess.gain, [(0, 0), (0, 0), (0, m)]), cost_to_go=None, prior=prior, trajectory=trajectory,
+        multipliers=(*guess.multipliers, *others),
+    )  # fmt: skip
 
 
-def _with_commands(states: npt.ArrayLike, controls: Array) -> Array:
-    """States (K, n) with the command before each; zeros before the first."""
-    commands = np.pad(controls, [(1, 0), (0, 0)])
-    return np.hstack([np.asarray(states), commands])
+def with_commands(plan: Trajectory) -> Trajectory:
+    """A plan with the command before each state; zeros before the first."""
+    commands = np.pad(plan.controls, [(1, 0), (0, 0)])
+    return replace(plan, states=np.hstack([np.asarray(plan.states), commands]))

@@ -21,7 +21,7 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import clearance_of, goal_radius_of
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian, meet_constraints
 from lqrsim.solvers.budget import Budget, Laps, Stop, check_threads
-from lqrsim.solvers.control_rates import feedback, narrowed, widened
+from lqrsim.solvers.control_rates import feedback, narrowed, widened, with_commands
 from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun, copied
 from lqrsim.solvers.finish import Known, finish
 from lqrsim.solvers.settings import FINE, InitialGuess, SmootherSettings, resolve
@@ -179,24 +179,37 @@ class PreparedSolver(OneVersion):
         clock = time.perf_counter()
         base = self.problem if problem is None else self.check(problem)
         problem = base.from_state(state, after=after, previous=previous)
-        if self._wide is not None:
-            return self._solve_wide(self._wide, problem, start, time_limit, clock)
-        stop = Stop(attentive=True, reserve=self._pace + self._closing)
-        if time_limit is not None:
-            stop.deadline = clock + time_limit
+        guess, planned = resolve(start, problem), None if isinstance(start, InitialGuess) else start.trajectory
+        deadline = np.inf if time_limit is None else clock + time_limit
+        if self._wide is None:
+            return self._solve(problem, guess, planned, clock, deadline)
+        # With a cost or limits of rates: the answer to the problem with the last command as a state.
+        wide, planned = with_last_command(problem), None if planned is None else with_commands(planned)
+        guess, begun = widened(guess, problem, wide), time.perf_counter()
+        wide_plan = self._wide._solve(wide, guess, planned, begun, max(deadline - self._closing, begun + 1e-9))
+        ended = time.perf_counter()
+        policy, cost_to_go = feedback(problem, wide_plan.trajectory, wide_plan.multipliers)
+        plan = narrowed(wide_plan, problem, policy, cost_to_go, seconds=0.0)
+        self._closing = max(0.5 * self._closing, time.perf_counter() - ended)
+        return replace(plan, seconds=time.perf_counter() - clock)
+
+    def _solve(
+        self, problem: Problem, guess: InitialGuess, planned: Trajectory | None, clock: float, deadline: float
+    ) -> Replan:
+        """The answer, begun at `clock`, from a guess that may be of a plan."""
+        stop = Stop(attentive=True, reserve=self._pace + self._closing, deadline=deadline)
         budget = Budget(self.settings.max_iterations, stop)
-        begin = np.asarray(state, dtype=np.float64)
-        run = SolveRun(problem, self.settings, resolve(start, problem), begin, budget)
+        run = SolveRun(problem, self.settings, guess, problem._start_or_zero, budget)
         best = _Best(run)
         with problem.dynamics.solving(self.threads):
             if problem.constraints and run.second_order:
-                finder = _Finder(run, _plan_of(start, best), best, self._closing)
+                finder = _Finder(run, _plan_of(planned, best), best, self._closing)
                 result, ended = finder.find(), finder.laps.ended
                 if finder.may_be_far:
                     best.consider(result)
                     result, ended = finish(run, Known()), time.perf_counter()
             else:
-                result = _solve(run, best)
+                result = _smoothed(run, best)
                 result = replace(result, cost=_cost_of(run, result.cost, result.plan, result.law))
                 ended = time.perf_counter()
         if stop.error is not None:
@@ -217,23 +230,6 @@ class PreparedSolver(OneVersion):
         self._closing = max(0.5 * self._closing, time.perf_counter() - ended)
         return answer
 
-    def _solve_wide(
-        self, solver: "PreparedSolver", problem: Problem, start: Plan | InitialGuess, time_limit: float | None,
-        clock: float,
-    ) -> Replan:  # fmt: skip
-        """The answer to a problem with a cost or limits of rates, begun at `clock`."""
-        wide = with_last_command(problem)
-        assert wide.start is not None
-        if time_limit is not None:
-            left = time_limit - (time.perf_counter() - clock) - self._closing
-            time_limit = max(left, 1e-9)
-        wide_plan = solver.solve(wide.start, widened(start, problem, wide), problem=wide, time_limit=time_limit)
-        ended = time.perf_counter()
-        policy, cost_to_go = feedback(problem, wide_plan.trajectory, wide_plan.multipliers)
-        plan = narrowed(wide_plan, problem, policy, cost_to_go, seconds=0.0)
-        self._closing = max(0.5 * self._closing, time.perf_counter() - ended)
-        return replace(plan, seconds=time.perf_counter() - clock)
-
 
 def _check_fixed(problem: Problem) -> None:
     """Raises InputError for a problem with a free duration."""
@@ -241,23 +237,22 @@ def _check_fixed(problem: Problem) -> None:
         raise InputError("problem: got a free duration, want a fixed one for solves in real time")
 
 
-def _plan_of(start: Plan | InitialGuess, best: "_Best") -> Motion:
+def _plan_of(planned: Trajectory | None, best: "_Best") -> Motion:
     """The plan to start from: the rollout of the old policy, but with the old plan's last state.
 
     A moving horizon has a last step for which the old policy was not made. If the rollout violates constraints, the old
     plan itself is used, from the new state.
     """
     plan = copied(best.result)
-    if isinstance(start, InitialGuess) or start.trajectory.states.shape != plan.states.shape:
+    if planned is None or planned.states.shape != plan.states.shape:
         return plan
-    planned = start.trajectory
     if best.result.violation > 0:
         plan.states[1:], plan.controls[...] = planned.states[1:], planned.controls
     plan.states[-1] = planned.states[-1]
     return plan
 
 
-def _solve(run: SolveRun, best: "_Best") -> RunResult:
+def _smoothed(run: SolveRun, best: "_Best") -> RunResult:
     """Smoothing, its safeguard and the augmented Lagrangian, until they converge or have to stop."""
     run.budget.stop.callback = best
     run.budget.report()
