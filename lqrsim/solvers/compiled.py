@@ -63,13 +63,18 @@ def compile_problem(
     Without multipliers no constraint acts. With `second_order` there are second derivatives of the dynamics.
     """
     acting = multipliers or [ConstraintMultipliers(problem, term) for term in problem.constraint_terms]
-    space, term = problem.control_coordinates, problem.noise_term
+    space, noise = problem.control_coordinates, ()
+    if (term := problem.noise_term) is not None:
+        value, quadratic = noise_module(problem, term).addresses("noise_value", "noise_quadratic")
+        n, knots, risk = len(problem.dynamics.state_coordinates), problem.steps + 1, np.array([problem.risk, 0.0, 0.0])
+        zeros = np.zeros((knots, n, n)), np.zeros((knots, n))  # the cost-to-go by which it may be weighed
+        noise = NoiseModel(value, quadratic, numbers_of(term), risk, *zeros)
     return ProblemModel(
         dynamics_model(problem.dynamics, second_order=second_order), float(problem.dt),
         initial=_cost(problem, "initial", []), stage=_cost(problem, "stage_cost", acting),
         final=_cost(problem, "final_cost", [constraint for constraint in acting if not constraint.term.uses_control]),
         limits=records.Limits(np.array(space.low, dtype=np.float64), np.array(space.high, dtype=np.float64)),
-        noise=() if term is None else _noise(problem, term),
+        noise=noise,
     )  # fmt: skip
 
 
@@ -134,13 +139,6 @@ def _constraint_functions(constraints: tuple[tuple[Source, int, bool, bool], ...
 def noise_module(problem: Problem, term: NoiseTerm) -> CompiledModule:
     """The compiled noise of a problem; see `kernels/noise.py`."""
     return module_of(term.code, "noise", **_sizes(problem.dynamics))
-
-
-def _noise(problem: Problem, term: NoiseTerm) -> NoiseModel:
-    value, quadratic = noise_module(problem, term).addresses("noise_value", "noise_quadratic")
-    n = len(problem.dynamics.state_coordinates)
-    hessian, gradient = np.zeros((problem.steps + 1, n, n)), np.zeros((problem.steps + 1, n))
-    return NoiseModel(value, quadratic, numbers_of(term), np.array([problem.risk, 0.0, 0.0]), hessian, gradient)
 
 
 def costs_module(problem: Problem) -> CompiledModule:

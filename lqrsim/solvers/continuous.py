@@ -447,8 +447,13 @@ def smooth_continuous(
             f"dynamics: got {problem.dynamics.name}, which has no rate, want dynamics with one; or use `smooth`"
         )
     tolerances = Tolerances(rtol=rtol, atol=atol)
-    control, prior = _initial_guess(problem, start)
-    state = problem._start_or_zero
+    prior = start.fitting(problem) if isinstance(start, InitialPrior) else None
+    if prior is not None and prior.obstacles:
+        raise InputError(f"start: got a prior with obstacles={prior.obstacles}, want one without in continuous time")
+    wanted, state = start.controls if isinstance(start, InitialPrior) else start, problem._start_or_zero
+    control = problem.nominal_control
+    if wanted is not None:
+        control = check_array("start", wanted, (len(problem.dynamics.control_coordinates),))
     check_functions(problem, control)
     check_start(problem, state, control)
 
@@ -468,17 +473,6 @@ def smooth_continuous(
         horizon=solver.horizon, iterations=tuple(iterations),
         _backward=solver.backward, _forward=solver.forward,
     )  # fmt: skip
-
-
-def _initial_guess(problem: Problem, start: npt.ArrayLike | InitialPrior | None) -> tuple[Array, InitialPrior | None]:
-    """The control (m,) of the first pass, and the prior. Raises InputError."""
-    prior = start.fitting(problem) if isinstance(start, InitialPrior) else None
-    if prior is not None and prior.obstacles:
-        raise InputError(f"start: got a prior with obstacles={prior.obstacles}, want one without in continuous time")
-    wanted = start.controls if isinstance(start, InitialPrior) else start
-    if wanted is None:
-        return problem.nominal_control, prior
-    return check_array("start", wanted, (len(problem.dynamics.control_coordinates),)), prior
 
 
 class _Smoother:

@@ -91,27 +91,23 @@ def guides(problem: Problem, count: int | None) -> list[tuple[str, InitialPrior 
     weight_of_path = path_weight(problem)
     if weight_of_path == 0 or problem.start is None or problem.goal is None:
         return [("nominal control", None)]
-    moving = _moving(problem)
+    moving, dynamics = _moving(problem), problem.dynamics
     ends = problem.start[moving], problem.goal[moving]
-    holding = bool(problem.dynamics.state_coordinates.position) and _stands(problem)
+    if holding := bool(dynamics.state_coordinates.position):
+        # Contacts may act at the start, or a control period later, when a robot on the floor has settled.
+        later = dynamics.step(problem.start, problem.nominal_control, problem.dt)
+        holding = dynamics.touches(np.array([problem.start, later]))
     weight = weight_of_path * _holding(problem) if holding else np.zeros(len(problem.start))
     weight[moving] = weight_of_path
     between = np.where(weight > 0, np.linspace(problem.start, problem.goal, problem.steps + 1), 0.0)
-    starts, unit = [], problem.dynamics.state_coordinates.units[moving[0]]
-    ring = RING if problem.dynamics.state_coordinates.position else FOLD
+    starts, unit = [], dynamics.state_coordinates.units[moving[0]]
+    ring = RING if dynamics.state_coordinates.position else FOLD
     for name, bend in bends(ends[1] - ends[0], STARTS if count is None else count, ring=ring, unit=unit):
         about = between.copy()
         about[:, moving] = path(*ends, bend, problem.steps)
         prior = InitialPrior(weight, about=about, iterations=CHOOSE if holding else 1, obstacles=OBSTACLES)
         starts.append((name, prior))
     return starts
-
-
-def _stands(problem: Problem) -> bool:
-    """Whether contacts act at the start, or a control period later, when a robot on the floor has settled."""
-    assert problem.start is not None
-    later = problem.dynamics.step(problem.start, problem.nominal_control, problem.dt)
-    return problem.dynamics.touches(np.array([problem.start, later]))
 
 
 def _holding(problem: Problem) -> Array:
