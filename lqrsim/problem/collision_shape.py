@@ -6,7 +6,7 @@ obstacles, with the methods that plans, chances of collision and simulations nee
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -625,17 +625,14 @@ class GeomsInWorld(ShapeInWorld):
     def distances(self, reach: float) -> tuple[Residual, tuple[int, ...]]:
         if self.world.moving:
             raise InputError("geoms: got obstacles that move, want balls=robot.balls for them")
-        model, obstacles = self.geoms.scene.model, self.geoms.obstacles
-        chosen = np.flatnonzero(np.isin(obstacles, self.numbers))
-        place = {int(number): i for i, number in enumerate(self.numbers)}
-        bodies = model.geom_bodyid[self.geoms.pairs[:, 0]].tolist()
-        keys = [(bodies[k], place[int(obstacles[k])]) for k in chosen]
+        each, model = self._to_each, self.geoms.scene.model
+        keys = list(zip(model.geom_bodyid[each.pairs[:, 0]].tolist(), each.rows.tolist(), strict=True))
         if len(set(keys)) > MOST_ROWS:
             keys = [(body, -1) for body, _ in keys]
         rows = sorted(set(keys))
         index = {key: row for row, key in enumerate(rows)}
-        count, numbered = max(1, len(rows)), np.array([index[key] for key in keys], dtype=np.int64)
-        pairs = GeomPairs(self.dynamics, model, self.geoms.pairs[chosen], numbered, count)
+        numbered = np.array([index[key] for key in keys], dtype=np.int64)
+        pairs = replace(each, rows=numbered, count=max(1, len(rows)))
         parts, numbers = tuple(model.body(body).name for body, _ in rows), tuple(number for _, number in rows)
         return pairs.residual(parts, reach), numbers
 
