@@ -253,18 +253,11 @@ class ReplannedRun(ControllerRun):
         self._runs = [FilterRun(law, 1, record) for _ in range(trials)]
         self.plans: list[dict[int, Trajectory]] = [{} for _ in range(trials)]
         self.log, self._sent = ReplanLog(), list[Array | None]([None] * trials)
-
-    @property
-    def estimates(self) -> Array | None:
-        return self._of_all([run.estimates for run in self._runs])
-
-    @property
-    def innovations(self) -> Array | None:
-        return self._of_all([run.innovations for run in self._runs])
-
-    def _of_all(self, records: list[Array | None]) -> Array | None:
-        known = [record for record in records if record is not None]
-        return np.concatenate(known, axis=1) if known else None
+        whole = FilterRun(law, trials, record)
+        self.estimates, self.innovations = whole.estimates, whole.innovations
+        if self.estimates is not None and self.innovations is not None:
+            for k, run in enumerate(self._runs):  # each writes its own part
+                run.estimates, run.innovations = self.estimates[:, k : k + 1], self.innovations[:, k : k + 1]
 
     def control(self, step: int, measured: Array) -> Array:
         commands: list[Array] = []

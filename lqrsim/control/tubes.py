@@ -17,7 +17,8 @@ from lqrsim.annotations import Share, checked, repr_of
 from lqrsim.control.controllers import BeliefFeedback, ControllerLike, Feedback, check_plan
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.plan_model import PlanModel
-from lqrsim.control.prediction import DeviationNorm, LinearLoop, Surroundings, sample_loop
+from lqrsim.control.prediction import LinearLoop, Surroundings, sample_loop
+from lqrsim.control.tracking import Judge
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_count, check_kind, check_seed
 from lqrsim.problem.belief import Belief
@@ -134,7 +135,8 @@ def predict_tube(
         offset = np.einsum("tij,tj->ti", policy.gain, at_plan) + policy.offset - plan.controls
         loop = LinearLoop(model, policy.gain, offset, None, policy.control_coordinates.limits)
         law = Feedback(policy)
-    surroundings, modelled = Surroundings.of(problem, uncertainty.obstacles), loop.model.uncertainty
+    judge, modelled = Judge(problem, solution, uncertainty), loop.model.uncertainty
+    surroundings, norm = judge.surroundings, judge.norm
     late = [f"{field} of {getattr(modelled, field)}" for field in ("latency", "delay") if getattr(modelled, field)]
     if samples is None:
         slow = problem.dynamics.by_mujoco or problem.dynamics.level in ("jax", "plain") or surroundings.by_mujoco
@@ -145,7 +147,6 @@ def predict_tube(
     if late and not samples:
         late_by = " and a ".join(late)
         raise InputError(f"predict_tube: samples: got 0, want more: moments leave out a {late_by} control periods")
-    norm = DeviationNorm.of(solution, problem.dynamics.state_coordinates.position)
     trials = sample_loop(loop.model, law, loop.limits, surroundings, norm, samples, seed) if samples else None
     moments, estimate = trials.moments if late and trials else loop.moments(), None
     model, n = loop.model, loop.model.n

@@ -231,7 +231,7 @@ class Collisions:
         for row in np.flatnonzero(self.clearance < 0):
             self._hit(int(row), 0.0, self._places[row])
 
-    def detect(self, step: int, period: Period, *, ignored: npt.NDArray[np.bool_]) -> None:
+    def detect(self, step: int, period: Period, *, ignored: Mask) -> None:
         """Find trials, except `ignored` ones (K,), that first collide in a period; obstacles may stop them in it."""
         begun, parts = self.at.copy(), len(period.states)
         for part, (states, touching) in enumerate(zip(period.states, period.touching, strict=True)):
@@ -246,12 +246,12 @@ class Collisions:
             self._physics.rerun_with_contacts(rows, period)
             self._relocate(period.states[-1])
 
-    def detect_at_end(self, time: float, *, ignored: npt.NDArray[np.bool_]) -> None:
+    def detect_at_end(self, time: float, *, ignored: Mask) -> None:
         """Detect contacts at the last knot, which no period follows."""
         if isinstance(self._physics, MujocoPhysics) and self._physics.senses_contacts:
             self._touch(time, self._physics.touching_now(), np.isinf(self.at) & ~ignored)
 
-    def _touch(self, time: float, touching: npt.NDArray[np.bool_], running: npt.NDArray[np.bool_]) -> None:
+    def _touch(self, time: float, touching: Mask, running: Mask) -> None:
         """Record contacts that MuJoCo detected, (K, obstacles), in the `running` trials (K,)."""
         for row in np.flatnonzero(running & touching.any(axis=1)):
             self.at[row] = time
@@ -262,7 +262,7 @@ class Collisions:
         self._places = self.shape.places(states)
         self.clearance = self._clear(self._places, self._time)
 
-    def _search_line(self, step: int, part: int, parts: int, arrived: Array, running: npt.NDArray[np.bool_]) -> None:
+    def _search_line(self, step: int, part: int, parts: int, arrived: Array, running: Mask) -> None:
         """Check the lines from the robot's last positions to the new ones, (K, B, 2 or 3) or (K, 1, n)."""
         last, before = self._places, self.clearance
         self._time = (step + (part + 1) / parts) * self.dt

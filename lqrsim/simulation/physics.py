@@ -13,6 +13,7 @@ from lqrsim.errors import Array
 from lqrsim.machine import processors
 from lqrsim.results.rollout import WARNINGS
 from lqrsim.robots.base import Indices
+from lqrsim.scenes.mjcf_kinematics import in_axes_of_bodies
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.simulator import Simulator, states_of
 
@@ -138,8 +139,9 @@ class MujocoPhysics(Physics):
         change(self.simulations)
 
     def displace(self, displaced: Array) -> None:
-        """Move the obstacles by (K, obstacles, 3)."""
-        self.plant.displace(self.simulations, displaced)
+        """Move the obstacles by (K, obstacles, 3) m, in the world's axes."""
+        model, geoms = self.plant.model, self.plant.obstacle_geoms
+        self.simulations.expand("geom_pos")[:, geoms] += in_axes_of_bodies(model, geoms, displaced)
 
     def prepare(self, *, altered: bool) -> None:
         """Make obstacles passable, and update all fields that depend on the `altered` ones."""

@@ -8,7 +8,7 @@ pictures.
 import copy
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any
@@ -30,7 +30,7 @@ from lqrsim.errors import (
     shaped,
     vectors_of,
 )
-from lqrsim.problem.collision_shape import CollisionSpheres, ShapeInWorld, shape_in
+from lqrsim.problem.collision_shape import CollisionSpheres, shape_in
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.pickles import OneVersion
 from lqrsim.results.rollout import BallRecord
@@ -81,7 +81,7 @@ class Plant(OneVersion):
         if simulator is not None:
             check_text("simulator: name", getattr(simulator, "name", None))
             check_number("simulator: timestep", getattr(simulator, "timestep", None), above=0.0)
-        check_names(robot, scene)
+        _check_names(robot, scene)
         self.robot, self.scene, self.simulator = robot, scene, simulator
         self._step: float | None = None  # s, in place of the timestep of the MJCF
         # The last undisturbed run of a plan's own policy: hash of the policy, the plan's states, and the run's.
@@ -126,7 +126,7 @@ class Plant(OneVersion):
             batch.Batch(self.model, 1, 1)
         except ValueError as error:
             raise InputError(f"scene {scene.name}: got an MJCF that cannot be run in batches: {error}") from None
-        check_maps(robot, scene, self.model, self.shape, clips=simulator is None)
+        _check_maps(self)
         if simulator is not None:
             if self.obstacles != self.world.names:
                 raise InputError(f"simulator: got robot {robot.name} without position and balls, want one with either")
@@ -252,22 +252,22 @@ class Plant(OneVersion):
             return None
         else:
             number, place, radius = mjcf_kinematics.farthest_out(self.model, self.body)
-            anchors, radii, centres = np.array([[number, *place]]), np.array([radius]), partial(self._at, number, place)
+            anchors, radii = np.array([[number, *place]]), np.array([radius])
+
+            def centres(states: Array) -> Array:
+                found = [data.xpos[number] + data.xmat[number].reshape(3, 3) @ place for data in self.posed(states)]
+                return np.reshape(found, (-1, 1, 3))
+
         places = np.full((*driven.shape[:2], len(radii), 3), np.nan)
         places[known] = centres(driven[known])
         return BallRecord(driven=places, planned=centres(planned), radii=radii, anchors=anchors)
 
-    def _at(self, number: int, place: Array, states: Array) -> Array:
-        """The position of a point of a body, (k, 1, 3), in these states (k, n)."""
+    def posed(self, states: Array) -> Iterator[mujoco.MjData]:
+        """MuJoCo's data with the places of all bodies in each of these states (k, n): one object, which changes."""
         positions = np.tile(self.model.qpos0, (len(states), 1))
-        positions[:, self.qpos] = self.robot.configuration(states)[0]
-        poses = mjcf_kinematics.posed(self.model, positions)
-        return np.reshape([data.xpos[number] + data.xmat[number].reshape(3, 3) @ place for data in poses], (-1, 1, 3))
-
-    def displace(self, simulations: batch.Batch, displaced: Array) -> None:
-        """Move the obstacles of K simulations by (K, obstacles, 3) m, in the world's axes; `set_const` must follow."""
-        geoms = self.obstacle_geoms
-        simulations.expand("geom_pos")[:, geoms] += mjcf_kinematics.in_axes_of_bodies(self.model, geoms, displaced)
+        for position, state in zip(positions, states, strict=True):
+            position[self.qpos] = self.robot.configuration(state)[0]
+        return mjcf_kinematics.posed(self.model, positions)
 
     def _compile(self, *, contacts: bool = True) -> mujoco.MjModel:
         spec = self.scene.mjcf.spec()
@@ -311,16 +311,14 @@ def extent(plant: Plant) -> float:
     The distance is seen from above for a robot that is seen from above; else it is the distance in space, for any
     plane. Moving parts count in all positions that their joints would allow without limits.
     """
-    model, data, dynamics = plant.model, mujoco.MjData(plant.model), plant.robot.dynamics
-    space, rng = dynamics.state_coordinates, np.random.default_rng(0)
+    model, space, off = plant.model, plant.robot.dynamics.state_coordinates, 0.0
     axes = [0, 1] if space.from_above else [0, 1, 2]  # axes of the world that count for distances
-    off, states = 0.0, rng.standard_normal((9, len(space)))
-    states[-1] = 0.0  # the last state, for the geoms below
-    for state in states:
-        data.qpos[plant.qpos], data.qvel[plant.qvel] = plant.robot.configuration(state)
-        mujoco.mj_kinematics(model, data)
+    states = np.random.default_rng(0).standard_normal((9, len(space)))
+    states[-1] = 0.0
+    for state, data in zip(states, plant.posed(states), strict=True):
         place = space.in_world(state[list(space.position)])
         off = max(off, float(np.linalg.norm((data.xpos[plant.body] - place)[axes])))
+    at_zero = next(plant.posed(states[-1:]))
     obstacles = [model.geom(name).id for name in plant.obstacles]
     thick = model.geom_margin + model.geom_gap  # distance at which MuJoCo detects a contact
     thickest = max(thick[obstacles].max(initial=0.0), (model.pair_margin + model.pair_gap).max(initial=0.0))
@@ -333,7 +331,7 @@ def extent(plant: Plant) -> float:
             reach = np.inf if model.geom_bodyid[geom] in plant.bodies else reach
             continue
         size, kind = float(model.geom_rbound[geom]) or np.inf, model.geom_type[geom]
-        if kind == mujoco.mjtGeom.mjGEOM_CYLINDER and space.from_above and abs(data.geom_xmat[geom][8]) > 1 - 1e-9:
+        if kind == mujoco.mjtGeom.mjGEOM_CYLINDER and space.from_above and abs(at_zero.geom_xmat[geom][8]) > 1 - 1e-9:
             size = float(model.geom_size[geom, 0])  # upright: its outline from above
         distance, jointed = np.linalg.norm(model.geom_pos[geom]), False
         for body in path:
@@ -344,7 +342,7 @@ def extent(plant: Plant) -> float:
                 slides = model.jnt_type[joint] in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_FREE)
                 distance += np.inf if slides else 2 * np.linalg.norm(model.jnt_pos[joint])
         if not jointed:
-            distance = np.linalg.norm((data.geom_xpos[geom] - data.xpos[plant.body])[axes])
+            distance = np.linalg.norm((at_zero.geom_xpos[geom] - at_zero.xpos[plant.body])[axes])
         reach = max(reach, float(distance) + size + float(thick[geom]))
     return off + reach + float(thickest)
 
@@ -373,7 +371,7 @@ def _separate(spec: mujoco.MjSpec, geoms: Sequence[mujoco.MjsGeom], apart: Pairs
             spec.delete(pair)
 
 
-def check_names(robot: Robot, scene: Scene) -> None:
+def _check_names(robot: Robot, scene: Scene) -> None:
     """Raise InputError unless the robot's body, joints, actuators and wheels are in the scene by their names.
 
     Its radius and its drag must not be negative, and its balls must be CollisionSpheres.
@@ -415,37 +413,34 @@ def _present(kind: str, names: list[str]) -> str:
     return f"{listed} ({which} none, counted from 0: name them there)"
 
 
-def check_maps(robot: Robot, scene: Scene, model: mujoco.MjModel, shape: ShapeInWorld, *, clips: bool) -> None:
-    """Raise InputError unless the robot's maps fit the model, and its body and balls are where its states say.
-
-    With `clips`, MuJoCo applies the controls, and clips those that exceed an actuator's ctrlrange.
-    """
-    in_qpos, in_qvel, in_ctrl = indices_in(robot, model)
+def _check_maps(plant: Plant) -> None:
+    """Raise InputError unless the robot's maps fit the model, and its body and balls are where its states say."""
+    robot = plant.robot
     n, m = len(robot.dynamics.state_coordinates), len(robot.dynamics.control_coordinates)
     qpos, qvel = (np.asarray(part) for part in robot.configuration(np.zeros(n)))
     joints, actuators = ", ".join(robot.joints) or "no joints", ", ".join(robot.actuators) or "no actuators"
     for field, got, want, of in (
-        ("configuration: qpos", qpos, len(in_qpos), joints),
-        ("configuration: qvel", qvel, len(in_qvel), joints),
-        ("actuation", np.asarray(robot.actuation(np.zeros(m))), len(in_ctrl), actuators),
+        ("configuration: qpos", qpos, len(plant.qpos), joints),
+        ("configuration: qvel", qvel, len(plant.qvel), joints),
+        ("actuation", np.asarray(robot.actuation(np.zeros(m))), len(plant.ctrl), actuators),
         ("state", np.asarray(robot.state(qpos, qvel)), n - robot.activations, "its dynamics"),
     ):
         if got.shape != (want,):
             raise InputError(f"robot {robot.name}: {field}: got shape {got.shape}, want ({want},) for {of}")
-    if clips:
-        _check_limits(robot, scene, model)
+    if plant.simulator is None:
+        _check_limits(plant)
     if robot.dynamics.state_coordinates.position:
-        _check_position(robot, model)
+        _check_position(plant)
     if robot.balls is not None:
-        _check_sites(robot, model, robot.balls, in_plane=shape.in_plane)
+        _check_sites(plant, robot.balls)
 
 
-def _check_limits(robot: Robot, scene: Scene, model: mujoco.MjModel) -> None:
+def _check_limits(plant: Plant) -> None:
     """Raise InputError if a control within its limits gives a command that exceeds an actuator's ctrlrange.
 
     MuJoCo would clip it silently, and records of applied controls would be wrong.
     """
-    space, (_, _, ctrl) = robot.dynamics.control_coordinates, indices_in(robot, model)
+    robot, model, ctrl, space = plant.robot, plant.model, plant.ctrl, plant.robot.dynamics.control_coordinates
     m = len(space)
     finite = np.clip(space.limits, -UNLIMITED, UNLIMITED)
     if m <= MIXED:  # every corner, because actuation may mix controls
@@ -464,33 +459,31 @@ def _check_limits(robot: Robot, scene: Scene, model: mujoco.MjModel) -> None:
     if exceeds.any():
         row, k = (int(place) for place in np.argwhere(exceeds)[0])
         controls = ", ".join(f"{name} {float(value):g}" for name, value in zip(space.names, corners[row], strict=True))
-        name = scene.mjcf.controls[ctrl[k]].name
+        name = plant.scene.mjcf.controls[ctrl[k]].name
         got = f"controls ({controls}), for which actuation() commands {commands[row, k]:g} of actuator {name!r}"
         own = f"its ctrlrange in the MJCF, {low[k]:g} to {high[k]:g}"
         raise InputError(f"robot {robot.name}: control_limits: got {got}, want {own}")
 
 
-def _check_position(robot: Robot, model: mujoco.MjModel) -> None:
+def _check_position(plant: Plant) -> None:
     """Raise InputError unless the body's origin is at the position, and moves with it, by MuJoCo's kinematics."""
-    space, (in_qpos, _, _) = robot.dynamics.state_coordinates, indices_in(robot, model)
-    n, data, number = len(space), mujoco.MjData(model), model.body(robot.body).id
+    robot, space, n = plant.robot, plant.robot.dynamics.state_coordinates, len(plant.robot.dynamics.state_coordinates)
 
-    def body(state: Array) -> Array:
-        data.qpos[in_qpos] = robot.configuration(state)[0]
-        mujoco.mj_kinematics(model, data)
-        return data.xpos[number].copy()
+    def origins(states: Array) -> Array:
+        return np.array([data.xpos[plant.body].copy() for data in plant.posed(states)])
 
     # About a state without zeros, so that angles have an effect.
-    middle = 0.1 + 0.01 * np.arange(n)
-    moves = np.array([(body(middle + step) - body(middle - step)) / 2 for step in np.eye(n)[list(space.position)]])
+    middle, steps = 0.1 + 0.01 * np.arange(n), np.eye(n)[list(space.position)]
+    moves = (origins(middle + steps) - origins(middle - steps)) / 2
     wanted = np.eye(3)[list(space.world_axes)]
     who = f"robot {robot.name}: position"
     names = [space.names[index] for index in space.position]
     if np.abs(moves - wanted).max() > OFF:
         raise InputError(f"{who}: got ({', '.join(names)}) in {_of(space)}; {_remedy(robot, names, moves)}")
-    for state in (np.zeros(n), middle):
+    states = np.array([np.zeros(n), middle])
+    for state, origin in zip(states, origins(states), strict=True):
         place = state[list(space.position)]
-        origin, said = body(state), space.in_world(place)
+        said = space.in_world(place)
         off = origin - said
         if space.from_above:
             off[2] = 0.0  # its height is not known
@@ -517,10 +510,10 @@ def anchor_of(model: mujoco.MjModel, site: str) -> Array:
     return np.array([model.geom_bodyid[number], *model.geom_pos[number]])
 
 
-def _check_sites(robot: Robot, model: mujoco.MjModel, balls: CollisionSpheres, *, in_plane: bool) -> None:
+def _check_sites(plant: Plant, balls: CollisionSpheres) -> None:
     """Raise InputError unless each ball that names a site or a geom has its centre there in MuJoCo."""
-    (in_qpos, _, _), data = indices_in(robot, model), mujoco.MjData(model)
-    who, n = f"robot {robot.name}: balls", len(robot.dynamics.state_coordinates)
+    model, dynamics = plant.model, plant.robot.dynamics
+    who, n = f"robot {plant.robot.name}: balls", len(dynamics.state_coordinates)
     names = [model.site(number).name for number in range(model.nsite)]
     names = list(filter(None, [*names, *(model.geom(number).name for number in range(model.ngeom))]))
     for site in filter(None, balls.sites):
@@ -528,15 +521,14 @@ def _check_sites(robot: Robot, model: mujoco.MjModel, balls: CollisionSpheres, *
             has = ", ".join(names) or "none"
             raise InputError(f"{who}: sites: got {excerpt(site)}, want a site or a geom of the MJCF; it has: {has}")
     anchors = [(k, site, anchor_of(model, site)) for k, site in enumerate(balls.sites) if site is not None]
-    rng = np.random.default_rng(0)
-    for state in (np.zeros(n), 0.1 + 0.01 * np.arange(n), *rng.uniform(-1.0, 1.0, (3, n))):
-        data.qpos[in_qpos] = robot.configuration(state)[0]
-        mujoco.mj_kinematics(model, data)
-        centres = balls.centres(robot.dynamics, state) if anchors else ()
+    drawn = np.random.default_rng(0).uniform(-1.0, 1.0, (3, n))
+    states = np.array([np.zeros(n), 0.1 + 0.01 * np.arange(n), *drawn])
+    for state, data in zip(states, plant.posed(states), strict=True):
+        centres = balls.centres(dynamics, state) if anchors else ()
         for k, site, (body, *place) in anchors:
             position = data.xpos[int(body)] + data.xmat[int(body)].reshape(3, 3) @ place
             off = position - centres[k]
-            if in_plane and robot.dynamics.state_coordinates.from_above:
+            if plant.shape.in_plane and dynamics.state_coordinates.from_above:
                 off[2] = 0.0  # its height is not known
             if not np.abs(off).max() <= OFF:
                 got = f"{balls.ball_names[k]!r} at {_point(centres[k])} m in the state {_point(state)}"
