@@ -410,7 +410,7 @@ class OffsetFree(Controller):
         self._rule = None if replan_every is None else self._replan_rule(replan_every)
         self._sensing = None if of_mjcf is None else self._sensor_filter(of_mjcf, replan_every)
         self.filter = kalman_filter(self.model) if self._sensing is None else self._sensing.along
-        judge = Judge(problem, solution, uncertainty)
+        judge = Judge(problem, solution, uncertainty.obstacles)
         if tolerate is None:
             moments = partial(with_filter, self.model, self.filter, solution.policy.control_coordinates.limits)
             weights, laws = choose_tolerances(judge, self.model, efforts, at_end, moments, call="OffsetFree(...)")

@@ -206,11 +206,11 @@ class Judge:
 
     problem: Problem
     solution: Solution
-    uncertainty: Uncertainty  # of the obstacles' positions
+    obstacles: float  # standard deviation of an obstacle's position, in m
 
     @cached_property
     def surroundings(self) -> Surroundings:
-        return Surroundings.of(self.problem, self.uncertainty.obstacles)
+        return Surroundings.of(self.problem, self.obstacles)
 
     @cached_property
     def norm(self) -> DeviationNorm:
@@ -393,7 +393,7 @@ def track(
             limits = solution.policy.control_coordinates.limits
             return LinearLoop(truth, laws.gain[..., : model.n], laws.offset, None, limits).moments(model.n)
 
-        judge = Judge(problem, solution, uncertainty)
+        judge = Judge(problem, solution, uncertainty.obstacles)
         _, law = choose_tolerances(judge, model, efforts, at_end, moments, truth, call="track(...)")
     return _policy_of(solution, law)
 

@@ -135,7 +135,7 @@ def predict_tube(
         offset = np.einsum("tij,tj->ti", policy.gain, at_plan) + policy.offset - plan.controls
         loop = LinearLoop(model, policy.gain, offset, None, policy.control_coordinates.limits)
         law = Feedback(policy)
-    judge, modelled = Judge(problem, solution, uncertainty), loop.model.uncertainty
+    judge, modelled = Judge(problem, solution, uncertainty.obstacles), loop.model.uncertainty
     surroundings, norm = judge.surroundings, judge.norm
     late = [f"{field} of {getattr(modelled, field)}" for field in ("latency", "delay") if getattr(modelled, field)]
     if samples is None:
