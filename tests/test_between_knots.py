@@ -8,6 +8,7 @@ import between_knots
 import numpy as np
 import pytest
 from failing_solves import rattled
+from mechanisms import arm
 from sampling import rarely
 from scipy.integrate import solve_ivp
 
@@ -40,14 +41,6 @@ SWING = ls.Problem(
     final_cost=ls.QuadraticCost([1.0, 1.0], about=[np.pi, 0.0]), constraints=[ls.GoalState([np.pi, 0.0])],
     control_limits=(-12.0, 12.0),
 )  # fmt: skip
-
-
-POLE = """<mujoco>
-  <worldbody><body>
-    <joint name="pole" axis="0 1 0"/><geom type="capsule" size=".02" fromto="0 0 0 0 0 .4"/>
-  </body></worldbody>
-  <actuator><motor joint="pole"/></actuator>
-</mujoco>"""
 
 
 class TestSubsteps:
@@ -214,7 +207,7 @@ def test_rows_within_periods_are_the_constraint_on_the_way(margin: float | Array
 
 
 def test_a_robot_of_an_mjcf_is_looked_at_after_each_physics_step(tmp_path: Path) -> None:
-    (tmp_path / "pole.xml").write_text(POLE, encoding="utf-8")
+    (tmp_path / "pole.xml").write_text(arm(0.4, names=("pole",)), encoding="utf-8")
     robot = ls.MjcfRobot(tmp_path / "pole.xml")
     n, m = len(robot.dynamics.state_coordinates), len(robot.dynamics.control_coordinates)
     name = robot.dynamics.state_coordinates.names[-1]

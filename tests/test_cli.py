@@ -16,6 +16,7 @@ import av
 import numpy as np
 import pytest
 from failing_solves import CASES
+from mechanisms import arm
 from sampling import rarely
 
 import lqrsim as ls
@@ -96,8 +97,7 @@ def test_list_names_every_scenario_with_units(capsys: pytest.CaptureFixture[str]
 
 def test_list_describes_the_robot_of_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "arm.xml"
-    path.write_text("""<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size=".1" pos=".3 0 0"/></body>
-      </worldbody><actuator><motor name="hinge" joint="hinge"/></actuator></mujoco>""", encoding="utf-8")  # fmt: skip
+    path.write_text(arm(0.3, names=("hinge",)), encoding="utf-8")
     assert main(["list", str(path)]) == 0
     printed = capsys.readouterr().out
     assert "  controls: hinge (N m)" in printed

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from comparing import assert_white
 from hypothesis import strategies as st
+from mechanisms import sled
 from scipy import stats
 from tracking import hover, weave
 
@@ -100,9 +101,7 @@ def test_descriptions_are_readable_and_in_units(arena, cage):
 @pytest.mark.parametrize("gravity", ["0 0 -9.81", "0 0 0"])
 def test_a_preset_has_no_disturbance_of_size_zero(gravity: str) -> None:
     """The force is a share of the weight, which there is not without gravity, and a control without limits has none."""
-    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><option gravity="{gravity}"/><worldbody><body>
-      <joint name="slide" type="slide" axis="1 0 0"/><geom size="0.1" mass="2"/></body></worldbody>
-      <actuator><motor joint="slide"/></actuator></mujoco>""", "puck"))  # fmt: skip
+    robot = ls.MjcfRobot(scene_from_xml(sled(option=f'gravity="{gravity}"'), "puck"))
     found = {type(one).__name__ for one in ls.disturbances.preset("light", ls.Plant(robot, robot.scene))}
     assert ("ForceNoise" in found) == (gravity != "0 0 0")
     assert "MeasurementNoise" in found

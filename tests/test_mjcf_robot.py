@@ -1311,10 +1311,7 @@ def test_bad_arguments_are_named() -> None:
 @pytest.mark.skipif(os.name != "posix", reason="Windows has no signals to send to a process")
 @pytest.mark.parametrize("solve", [ls.ilqr, ls.smooth])
 def test_ctrl_c_ends_an_iteration_that_would_take_minutes(solve: Any) -> None:
-    xml = """
-    <mujoco><option timestep="1e-6"/><worldbody><body><joint name="hinge" axis="0 1 0"/><geom size="0.1" pos="0 0 -1"/>
-    </body></worldbody><actuator><motor joint="hinge"/></actuator></mujoco>"""
-    robot = ls.MjcfRobot(scene_from_xml(xml, "pendulum"))
+    robot = ls.MjcfRobot(scene_from_xml(arm(1.0, names=("hinge",), option='timestep="1e-6"'), "pendulum"))
     quick, endless = (robot.problem(robot.at(), robot.at(hinge=1.0), steps=200, dt=dt) for dt in (1e-6, 0.5))
     solve(quick, max_iterations=1)  # compiles
     ctrl_c = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
@@ -1458,10 +1455,11 @@ def test_a_clearance_that_start_and_goal_lack_is_named(tmp_path: Path, caplog: p
     """As that of a boat on slides, whose water is a plane below it that it can never touch."""
     path = tmp_path / "boat.xml"
     path.write_text(
-        """<mujoco><worldbody><geom name="water" type="plane" size="9 9 1"/><geom name="buoy" size="0.2" pos="2 2 0"/>
-        <body pos="0 0 0.15"><joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
-        <geom size="0.1" mass="1"/></body></worldbody>
-        <actuator><motor joint="x"/><motor joint="y"/></actuator></mujoco>"""
+        sled(
+            "xy",
+            place="0 0 0.15",
+            things='<geom name="water" type="plane" size="9 9 1"/><geom name="buoy" size="0.2" pos="2 2 0"/>',
+        )
     )
     robot = ls.MjcfRobot(path)
     robot.problem(robot.at(), robot.at(x=1.0), clearance=0.04)

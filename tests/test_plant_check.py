@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mechanisms import Jointed
+from mechanisms import Jointed, sled
 from planar_quadrotor import BLOCK, PlanarQuadrotor, mjcf
 from sampling import examples
 from tracking import track, weave
@@ -123,7 +123,7 @@ class Spinner(Jointed):
 
     @property
     def joints(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return ("along", "spin") if self.turns else ("along",)
+        return ("x", "spin") if self.turns else ("x",)
 
     @property
     def actuators(self):  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -153,10 +153,12 @@ def test_a_fast_wheel_hides_no_fault_of_the_cart(thrust: float, seed: int) -> No
     found = []
     for turns in (False, True):
         scene = scene_from_xml(
-            f"""<mujoco><option timestep="0.005" integrator="RK4" gravity="0 0 0"/><worldbody><body name="cart">
-              <joint name="along" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/></body>{wheel if turns else ""}
-              </worldbody><actuator><motor name="push" joint="along"/>
-              {'<motor name="drive" joint="spin"/>' if turns else ""}</actuator></mujoco>""",
+            sled(
+                name="cart",
+                option='timestep="0.005" integrator="RK4" gravity="0 0 0"',
+                actuators='<motor name="push" joint="x"/>' + '<motor name="drive" joint="spin"/>' * turns,
+                things=wheel * turns,
+            ),
             "rails",
         )
         found.append(ls.check_plant(Spinner(thrust=thrust, turns=turns), scene, seed=seed))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from failing_solves import CASES, UPRIGHT, mass, problem, reach, swing
+from mechanisms import sled
 
 import lqrsim as ls
 from lqrsim.kernels.records import Motion, Policy
@@ -167,17 +168,18 @@ def test_what_a_plan_grazes_is_named_and_among_the_obstacles_it_is_passed(
 
     With elliptic cones, there is no descent within contact modes either.
     """
-    text = f"""<mujoco><option timestep="0.02" cone="elliptic"/><worldbody>
-      <geom name="{pillar}" type="cylinder" size="0.2 0.5" pos="0.5 {aside} 0"/>
-      <body name="disc"><joint name="disc_x" type="slide" axis="1 0 0"/><joint name="disc_y" type="slide" axis="0 1 0"/>
-        <geom type="sphere" size="0.1" mass="{mass}"/></body></worldbody>
-      <actuator><motor name="fx" joint="disc_x" ctrlrange="-9 9"/><motor name="fy" joint="disc_y" ctrlrange="-9 9"/>
-      </actuator></mujoco>"""
+    text = sled(
+        "xy",
+        geom=f'size="0.1" mass="{mass}"',
+        limits=(9, 9),
+        option='timestep="0.02" cone="elliptic"',
+        things=f'<geom name="{pillar}" type="cylinder" size="0.2 0.5" pos="0.5 {aside} 0"/>',
+    )
     scene = scene_from_xml(text, "disc")
 
     def solved(clearance: float | None, **obstacles: Any) -> ls.Solution:
         robot = ls.MjcfRobot(scene, **obstacles)
-        ends = robot.at(), robot.at(disc_x=1.0)
+        ends = robot.at(), robot.at(x=1.0)
         stated = robot.problem(*ends, steps=30, dt=0.04, clearance=clearance, control_rate=rate)
         return ls.smooth(stated, starts=1, max_iterations=60, threads=1)
 

@@ -14,6 +14,7 @@ import browsing
 import mujoco
 import numpy as np
 import pytest
+from mechanisms import sled
 from planar_arm import LENGTH, LINK, PlanarArm
 from viewers import Recorder, said, said_after, viewing
 
@@ -256,10 +257,7 @@ def test_keys_move_what_is_held(quadrotor: ls.Scenario, quadrotor_solution: ls.S
 
 
 def test_the_goal_of_a_robot_without_a_radius_is_seen(tmp_path: Path) -> None:
-    (tmp_path / "point.xml").write_text(
-        """<mujoco><worldbody><body name="point"><joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide"
-        axis="0 1 0"/><geom size=".1"/></body></worldbody><actuator><motor joint="x"/></actuator></mujoco>"""
-    )
+    (tmp_path / "point.xml").write_text(sled("xy", actuators='<motor joint="x"/>'))
     robot = ls.MjcfRobot(str(tmp_path / "point.xml"), radius=0.0)
     goal = MovableGoal(robot.problem(np.zeros(4), np.ones(4), steps=5))
     model, name = model_with_goal(ls.Plant(robot, robot.scene), goal)

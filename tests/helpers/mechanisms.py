@@ -68,20 +68,22 @@ def arm(
 def sled(
     axes: str = "x",
     *,
+    name: str = "sled",
     joint: str = "",
     geom: str = 'type="sphere" size="0.1" mass="1"',
+    place: str = "0 0 0",
     limits: Sequence[float] = (),
     actuators: str = "",
     option: str = 'timestep="0.01" gravity="0 0 0"',
     things: str = "",
     more: str = "",
 ) -> str:
-    """A body that slides along these axes, whose names its joints and motors have."""
+    """A body, with a geom of the same name, that slides along these axes, whose names its joints and motors have."""
     slides = "".join(
         f'<joint name="{axis}" type="slide" axis="{" ".join("01"[axis == one] for one in "xyz")}" {joint}/>'
         for axis in axes
     )
-    body = f'<body name="sled">{slides}<geom name="sled" {geom}/></body>'
+    body = f'<body name="{name}" pos="{place}">{slides}<geom name="{name}" {geom}/></body>'
     return scene(body, actuators or motors(axes, limits), option=option, things=things, more=more)
 
 

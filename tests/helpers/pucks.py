@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from linear_plans import by_hand
-from mechanisms import Jointed
+from mechanisms import Jointed, sled
 
 import lqrsim as ls
 from lqrsim.errors import Array
@@ -17,21 +17,6 @@ DT, STEPS = 0.1, 20
 STIFFNESS, DAMPING = 0.3, 0.4  # so weak that much is left at the end
 RADIUS = 0.1
 
-MJCF = """
-<mujoco model="ice">
-  <option timestep="0.1" integrator="RK4" gravity="0 0 0"/>
-  <worldbody>
-    {wall}
-    <body name="puck">
-      <joint name="puck_x" type="slide" axis="1 0 0"/>
-      <joint name="puck_y" type="slide" axis="0 1 0"/>
-      <geom type="cylinder" size="0.1 0.03" mass="1"/>
-    </body>
-  </worldbody>
-  <actuator><motor name="push_x" joint="puck_x"/><motor name="push_y" joint="puck_y"/></actuator>
-</mujoco>
-"""
-
 
 @dataclass(frozen=True)
 class Puck(Jointed):
@@ -39,8 +24,7 @@ class Puck(Jointed):
 
     name = "puck"
     body = "puck"
-    joints = ("puck_x", "puck_y")
-    actuators = ("push_x", "push_y")
+    joints = actuators = ("x", "y")
 
     @property
     def dynamics(self) -> ls.Dynamics:
@@ -55,7 +39,9 @@ def plant(folder: Path, *, wall: float | None = None) -> ls.Plant:
     """A plant with a wall at x = `wall`, or without one."""
     geom = "" if wall is None else f'<geom name="wall" type="box" size="0.5 9 1" pos="{wall + 0.5} 0 0"/>'
     path = folder / "ice.xml"
-    path.write_text(MJCF.format(wall=geom), encoding="utf-8")
+    option = 'timestep="0.1" integrator="RK4" gravity="0 0 0"'
+    text = sled("xy", name="puck", geom='type="cylinder" size="0.1 0.03" mass="1"', option=option, things=geom)
+    path.write_text(text, encoding="utf-8")
     return ls.Plant(Puck(), ls.load_scene(str(path)))
 
 
