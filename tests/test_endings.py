@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import mechanisms
 import mujoco
 import numpy as np
 import pytest
@@ -44,18 +45,13 @@ from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.results import Results, differences, replay
 from lqrsim.stress.study import Campaign, Trials
 
-ARM = """<mujoco>
-  <option timestep="0.01"/>
-  <worldbody>
-    <geom name="floor" type="plane" size="2 2 0.1" pos="0 0 -0.5"/>
-    <geom name="post" type="cylinder" size="0.05 0.5" pos="0.5 0.5 0"/>
-    <body name="arm">
-      <joint name="shoulder" type="hinge" axis="0 0 1" damping="1"/>
-      <geom type="capsule" fromto="0 0 0 1 0 0" size="0.03" mass="1"/>
-    </body>
-  </worldbody>
-  <actuator><motor name="torque" joint="shoulder" ctrlrange="-5 5"/></actuator>
-</mujoco>"""
+BENCH = """<geom name="floor" type="plane" size="2 2 0.1" pos="0 0 -0.5"/>
+  <geom name="post" type="cylinder" size="0.05 0.5" pos="0.5 0.5 0"/>"""
+ARM = mechanisms.arm(
+    1.0, names=("shoulder",), joint='axis="0 0 1" damping="1"', geom='size="0.03" mass="1"', limits=(5,),
+    option='timestep="0.01"', things=BENCH,
+)  # fmt: skip
+UPPER = '<body name="upper" pos="0 0 0">'
 
 CART_POLE = """<mujoco>
   <option timestep="0.01" integrator="RK4"/>
@@ -77,9 +73,8 @@ CART_POLE = """<mujoco>
 @dataclass(frozen=True)
 class Arm(Jointed):
     name = "arm"
-    body = "arm"
-    joints = ("shoulder",)
-    actuators = ("torque",)
+    body = "upper"
+    joints = actuators = ("shoulder",)
 
     @cached_property
     def dynamics(self):  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -302,7 +297,7 @@ class Handed(Arm):
 @pytest.mark.parametrize("kind", [Arm, Handed])
 def test_what_an_exclude_keeps_apart_never_collides(swing: ls.Solution, kind: Callable[[], Robot]) -> None:
     """As in MuJoCo: its arm goes through the post, and no clearance is measured to it."""
-    exclude = '<contact><exclude body1="arm" body2="world"/></contact>'
+    exclude = '<contact><exclude body1="upper" body2="world"/></contact>'
     scene = scene_from_xml(ARM.replace("<actuator>", f"{exclude}<actuator>"), "bench")
     plant = Plant(kind(), scene)
     data = mujoco.MjData(scene.model)
@@ -323,7 +318,7 @@ def test_a_pedestal_does_not_collide_with_the_arm_that_it_carries(
     """They overlap in every position. A fist that the pedestal does not carry can still hit it."""
     pedestal = '<geom name="pedestal" type="cylinder" size="0.1 0.25" pos="0 0 -0.24"/>'
     fist = '<geom type="sphere" pos="1 0 0" size="0.04" mass="1e-9"/>'
-    xml = ARM.replace('<body name="arm">', f'{pedestal}<body name="arm">{fist}')
+    xml = ARM.replace(UPPER, f"{pedestal}{UPPER}{fist}")
     plant = Plant(kind(), scene_from_xml(xml.replace('pos="0.5 0.5 0"', 'pos="5 5 0"'), "bench"))
     assert "pedestal" in plant.obstacles
     rollout = ls.simulate(plant, swing)
