@@ -149,7 +149,7 @@ class Task:
             disturbances += disturbance_set(item, self.scenario) if isinstance(item, str) else (item,)
         return tuple(disturbances if strength == 1 else [disturbance.scaled(strength) for disturbance in disturbances])
 
-    def trials(self, following: int, options: Any) -> tuple[int, tuple[Disturbance, ...]]:
+    def choices_of(self, options: Any, following: int) -> tuple[int, tuple[Disturbance, ...]]:
         """The first trial for the options of a `reset`, by default `following`, and the disturbances."""
         settings = reset_options(options)
         for name in settings:
@@ -224,7 +224,7 @@ class Resettable:
         elif self._seed is None:
             self._seed = int(random.integers(2**63))
         assert self._seed is not None
-        first, disturbances = self.task.trials(self._next_trial, options)
+        first, disturbances = self.task.choices_of(options, self._next_trial)
         self._episode = Episode(
             self.task, self._trials, disturbances=disturbances, seed=self._seed, first_trial=first,
             frames=self._frames, threads=self._threads,
@@ -280,26 +280,34 @@ class Episode:
             loop.period()
             if loop.step == self._plan.steps:
                 loop.detect_contacts_at_end()
-        running = ~self.ended
-        lost = loop.records.over(loop.step)
-        collided = np.isfinite(loop.collisions.at)
-        at_horizon = loop.step == self._plan.steps
-        self._terminated[running] = (lost | collided)[running]
-        self._truncated[running] = at_horizon & ~(lost | collided)[running]
-        rewards = np.zeros(len(running))
-        rewards[running] = -self._costs.stage(step, states, loop.records.applied[:, step])[running]
+        running, at_horizon = ~self.ended, loop.step == self._plan.steps
+        lost, collided = loop.records.over(loop.step), np.isfinite(loop.collisions.at)
+        over = lost | collided
+        self._terminated[running] = over[running]
+        self._truncated[running] = at_horizon & ~over[running]
         ending = (self._terminated | self._truncated) & running
-        if ending.any():
-            # A trial that has become unstable has no valid state; use the previous state.
-            last = np.where(lost[:, None], states, self.states)
-            rewards[ending] -= self._costs.final(last, loop.records.applied[:, step])[ending]
+        # A trial that has become unstable has no valid state; its last state is the previous one.
+        rewards = self._rewards(step, states, running, np.where(lost[:, None], states, self.states), ending)
         self._observations[running] = self._observe(lost)[running]
         self.ended |= ending
         if ending.any():
-            first = loop.collisions.at <= loop.records.time_of(loop.records.lost_since)
-            early = np.where(collided & first, "collided", "diverged").astype(object)
-            self.outcomes[ending] = (np.array(loop.so_far().outcome, dtype=object) if at_horizon else early)[ending]
+            self.outcomes[ending] = self._outcomes(collided, at_horizon)[ending]
         return self.observations, rewards, self._terminated.copy(), self._truncated.copy()
+
+    def _rewards(self, step: int, states: Array, running: Flags, last: Array, ending: Flags) -> Array:
+        """Minus the stage costs of the trials that are running, and minus the final costs of those that end."""
+        rewards, applied = np.zeros(len(running)), self.loop.records.applied[:, step]
+        rewards[running] = -self._costs.stage(step, states, applied)[running]
+        if ending.any():
+            rewards[ending] -= self._costs.final(last, applied)[ending]
+        return rewards
+
+    def _outcomes(self, collided: Flags, at_horizon: bool) -> npt.NDArray[np.object_]:
+        loop = self.loop
+        if at_horizon:
+            return np.array(loop.so_far().outcome, dtype=object)
+        first = loop.collisions.at <= loop.records.time_of(loop.records.lost_since)
+        return np.where(collided & first, "collided", "diverged").astype(object)
 
     def _observe(self, lost: Flags | None = None) -> Array:
         """Measured states, and time as a fraction of the horizon; for unstable trials the last valid states."""
