@@ -113,36 +113,32 @@ class Search:
         is_plan = self._settings.start is not None and guess.prior is None and guess.interior is None
         given = begun[0].given() if is_plan else None
         with self._stop.reporting("smooth"):
-            self.make_attempts(given, trees=trees)
+            # The attempts after this block also solve problems with other dynamics, and set the threads for each.
+            with self._problem.dynamics.solving(self._solving):
+                self.choose_start()
+                if trees and self.may_go_on and self.is_barred:
+                    self.grow_trees()
+                if self._settings.start is None and self._exact and not self._guided:
+                    self.try_detours()
+                self.leave_saddles()  # while the best plan is one
+            if self._default and self.may_go_on and self._unmoved():
+                self.push_and_approach()
+            too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self._named)
+            if self._problem.risk > 0 and too_high and self.may_go_on:
+                self.retry_without_risk()
+            alone = self._best_nearer is not None and not self._comes_nearer(self.best[1])  # it leaves a body alone
+            if self._default and self.may_go_on and (alone or not self.best[1].success):
+                self.soften_contacts()
+            if given is not None:
+                self.keep_given(given)
+            if not self.best[1].success and self.may_go_on:
+                self.alternate_softness()
+            if not self.best[1].success and self.may_go_on:
+                self.leave_contact_modes()
         solution = self._solution()
         for run in begun:
             run.give_back()
         return solution
-
-    def make_attempts(self, given: RunResult | None, *, trees: bool) -> None:
-        """Make all attempts in turn, as far as they are called for."""
-        # The attempts after this block also solve problems with other dynamics, and set the number of threads for each.
-        with self._problem.dynamics.solving(self._solving):
-            self.choose_start()
-            if trees and self.may_go_on and self.is_barred:
-                self.grow_trees()
-            if self._settings.start is None and self._exact and not self._guided:
-                self.try_detours()
-            self.leave_saddles()  # while the best plan is one
-        if self._default and self.may_go_on and self._unmoved():
-            self.push_and_approach()
-        too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self._named)
-        if self._problem.risk > 0 and too_high and self.may_go_on:
-            self.retry_without_risk()
-        alone = self._best_nearer is not None and not self._comes_nearer(self.best[1])  # the best leaves a body alone
-        if self._default and self.may_go_on and (alone or not self.best[1].success):
-            self.soften_contacts()
-        if given is not None:
-            self.keep_given(given)
-        if not self.best[1].success and self.may_go_on:
-            self.alternate_softness()
-        if not self.best[1].success and self.may_go_on:
-            self.leave_contact_modes()
 
     def choose_start(self) -> tuple[SolveRun, RunResult]:
         """Finish the most promising of the given starts, and of others where it leads to a poor plan; the best run."""
