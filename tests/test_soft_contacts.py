@@ -259,3 +259,15 @@ def test_a_failed_plan_among_contacts_says_that_time_was_over(monkeypatch: pytes
     assert solution.status is ls.Status.TIME_LIMIT
     assert np.isfinite(solution.cost)
     assert solution.remedy.startswith("raise time_limit")
+
+
+@pytest.mark.parametrize("limit", [5, 9])
+def test_a_plan_for_softer_contacts_is_a_start_with_iterations_of_its_own(
+    monkeypatch: pytest.MonkeyPatch, limit: int
+) -> None:
+    """However many the first start has used."""
+    for attempt in ("alternate_softness", "leave_contact_modes"):
+        monkeypatch.setattr(strategy.Search, attempt, lambda search: None)
+    solution = ls.smooth(hop(robot_of("leg", 1.0)), max_iterations=limit)
+    used = {one.start: one.iterations for one in solution.candidates}
+    assert used["nominal control"] == used["a plan for softer contacts"] == limit

@@ -505,7 +505,7 @@ class Search:
             return
         (name, widest), *harder = self._soft
         if moved is not None:
-            self._stiffen({f", {moved[0]}": begin}, harder, [], self._named[0][1].budget.left)
+            self._stiffen({f", {moved[0]}": begin}, harder, [])
             if self.best[1].success or self._stop.due:
                 return
         results = {"": self._keep_softer(name, *self._searched(widest))}
@@ -513,7 +513,7 @@ class Search:
             if not self._stop.due:
                 begin, origin = sinusoidal_controls(widest, side * cycles), f", {sinusoidal_name(side * cycles)}"
                 results[origin] = self._solve_softly(f"{name}{origin}", widest, begin, LOOK)
-        self._stiffen(results, harder, [name], self._named[0][1].budget.left)
+        self._stiffen(results, harder, [name])
 
     def alternate_softness(self) -> None:
         """Soften the cheapest plan's contacts a little, stiffen them, and keep its modes, in turn.
@@ -556,12 +556,13 @@ class Search:
         return min(finite, key=lambda result: result.cost, default=self.best[1])
 
     def _stiffen(
-        self, plans: dict[str, RunResult], soft: Sequence[tuple[str, Problem]], before: list[str], most: int
-    ) -> RunResult | None:
+        self, plans: dict[str, RunResult], soft: Sequence[tuple[str, Problem]], before: list[str],
+        most: int | None = None,
+    ) -> RunResult | None:  # fmt: skip
         """Continue from these plans for each softness in turn, from fewer at each, and then for the true contacts.
 
         The plans, by the ends of their names, have passed the softnesses `before`. Returns the plan for the true
-        contacts, after `most` iterations there at most; None if no time is left for it.
+        contacts, after `most` iterations there at most, if that is given; None if no time is left for it.
         """
         for name, problem in soft:
             most_soft = LOOK if len(plans) > 1 else SOFT
