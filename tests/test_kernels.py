@@ -1237,11 +1237,11 @@ class TestControl:
             lambda x, u, p: [u[0]] * 4, states=dict.fromkeys("abcd", ""), controls={"u": ""}, **turns
         )
         space = dynamics.state_coordinates
-        rng, sizes, source = np.random.default_rng(0), {"N": 4, "M": 2}, source_of(feedback, Z=4)
+        rng, sizes, source = np.random.default_rng(0), {"N": 4, "M": 2, "W": 6}, source_of(feedback)
         near, law = 5 * rng.normal(size=(3, 4)), Policy(rng.normal(size=(2, 4)), rng.normal(size=2))
         near[0, 1:] = 0.0
         limits, turning = Limits(np.full(2, -1.0), np.full(2, 1.0)), turning_of(space)
-        replay(source, sizes, "command", 3, near, rng.normal(size=4), law, limits, turning, np.zeros((3, 2)))
+        replay(source, sizes, "apply_policy", 3, near, law, rng.normal(size=4), turning, limits, np.zeros((3, 2)))
         replay(source, sizes, "all_to_nearest", 2, 2, 5 * rng.normal(size=(4, 4)), rng.normal(size=(2, 4)), turning)
 
     @pytest.mark.parametrize("lag", [0, 2])

@@ -38,7 +38,7 @@ def evaluator(policy: AffinePolicy) -> Callable[[AffinePolicy, int, Array], Arra
     def evaluate(policy: AffinePolicy, row: int, measured: Array) -> Array:
         x, out = np.array(measured, dtype=np.float64), np.empty((len(measured), len(controls)))
         law = Policy(in_c_order(policy.gain[row]), in_c_order(policy.offset[row]))
-        laws.command(len(x), x, in_c_order(policy.nominal[row]), law, limits, turning, out)
+        laws.apply_policy(len(x), x, law, in_c_order(policy.nominal[row]), turning, limits, out)
         return out
 
     return evaluate
@@ -51,7 +51,7 @@ def turn_to_nearest(space: Coordinates, states: Array, nominal: Array) -> None:
 
 
 def _laws(n: int, m: int) -> CompiledModule:
-    return module_of(source_of(feedback, Z=n), f"policies of {n} states and {m} controls", N=n, M=m)
+    return module_of(source_of(feedback), f"policies of {n} states and {m} controls", N=n, M=m, W=n + m)
 
 
 def turning_of(space: Coordinates) -> AngularStates:

@@ -9,6 +9,7 @@ from math import floor, nan, pi, sqrt
 
 from lqrsim.kernels.declarations import M, N, call, outline, stack
 from lqrsim.kernels.linear_algebra import affine, clear, copy, copy_part, fill
+from lqrsim.kernels.riccati import limited_control
 
 LAG, D, Y = 0, 1, 1  # counts of lagging controls, states of unknowns, measured numbers
 P, Z, V = 1, 1, 1  # unknown parameters; N + LAG + D; P + 2 M
@@ -145,7 +146,7 @@ def predict_one(control, predictor, z):
 def command(count, estimates, nominal, policy, limits, angular, out):
     """Write the controls (count, M), within their limits, of a policy with gains (M, Z) on the estimates (count, Z).
 
-    These may be states alone: Z is N then. They are overwritten by their representatives nearest to `nominal` (N,).
+    The estimates' angles are replaced by the representatives nearest to `nominal` (N,).
     """
     for k in range(count):
         command_one(estimates[k], nominal, policy, limits, angular, out[k])
@@ -167,6 +168,22 @@ def diverged(count, estimates, out):
         for i in range(Z - 1, -1, -1):
             if not abs(estimates[k, i]) <= FAR:
                 out[k] = i
+
+
+def apply_policy(count, states, policy, nominal, angular, limits, out):
+    """Write the controls (count, M), within their limits, at states (count, N).
+
+    The states are overwritten by their representatives nearest to the nominal (N,).
+    """
+    for k in range(count):
+        apply_one(states[k], policy, nominal, angular, limits, out[k])
+
+
+@outline
+def apply_one(x, policy, nominal, angular, limits, u):
+    """Write the control (M,) at one state (N,)."""
+    to_nearest(x, nominal, angular)
+    limited_control(policy.gain, policy.offset, x, limits, u)
 
 
 def all_to_nearest(steps, count, states, nominal, angular):
