@@ -28,7 +28,6 @@ import numpy as np
 import tyro
 
 import lqrsim as ls
-from lqrsim.commands.console import text_of
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class Config:
 
 
 def main(config: Config) -> dict[str, Any]:
-    from lqrsim.machine import versions  # an older checkout, which imports this file too, may have it elsewhere
+    from lqrsim.machine import versions  # here, for another checkout, which runs this file too, may have it elsewhere
 
     if config.quick:
         config = replace(config, queries=2, trials=2)
@@ -245,6 +244,8 @@ def report(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
+    from lqrsim.commands.console import text_of
+
     config = tyro.cli(Config, description=__doc__)
     result = main(config)
     print(text_of(result) if config.json else report(result))
