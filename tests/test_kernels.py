@@ -529,7 +529,7 @@ class TestSolvers:
             np.zeros((steps + 1, n)),
         )  # fmt: skip
         sizes = {"N": n, "M": m, "W": n + m, "NOISY": 0, "PRIMAL": int(form == "primal")}
-        replay(source_of(iterations), sizes, "lq_passes", steps, forward, forward, costs, np.zeros(steps), work)
+        replay(source_of(passes), sizes, "lq_passes", steps, forward, forward, costs, np.zeros(steps), work)
 
 
 class Begun:
@@ -823,8 +823,7 @@ class TestRareEnds:
             )  # fmt: skip
             sizes = SIZES | {"NOISY": 0, "PRIMAL": int(form == "primal")}
             assert (
-                replay(source_of(iterations), sizes, "lq_passes", 3, forward, backwards, costs, np.zeros(3), work)
-                == wanted
+                replay(source_of(passes), sizes, "lq_passes", 3, forward, backwards, costs, np.zeros(3), work) == wanted
             )
 
     def test_parts_of_steps_that_are_taken_back(self) -> None:
@@ -1474,7 +1473,7 @@ class TestPlanMethods:
     def test_models_and_steps(self) -> None:
         """The entries that no method leads to; and models that have no minimum."""
         stages, plan = self.made()
-        source, rng = source_of(iterations), np.random.default_rng(0)
+        source, rng = source_of(interior_point), np.random.default_rng(0)
         costates, rows = rng.normal(size=(4, 3)), stages.live.size
         assert replay(source, SIZES, "determine_scales", stages.about, plan) > 0
         stages.force[...] = stages.live * rng.uniform(0.1, 1.0, size=stages.live.shape)

@@ -56,6 +56,7 @@ from lqrsim.kernels.stages import (
     row_change,
     write_models,
 )
+from lqrsim.kernels.stages import least_curvatures as least_curvatures  # for Python
 
 COMPACT = 1  # all functions but those that are inline
 

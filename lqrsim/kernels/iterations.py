@@ -1,8 +1,7 @@
-"""Iterations of LQR smoothing and of iLQR, and a descent, all in compiled code; and all else that Python calls.
+"""Iterations of LQR smoothing and of iLQR, and a descent, all in compiled code.
 
-Python calls `smoother` and `ilqr`, and functions that are imported here for it: methods for constraints, and single
-passes and rollouts. All code that a solve can need is compiled together, before the solve begins. Code that its parts
-share is compiled once.
+Python calls `smoother` and `ilqr`, and functions that are imported here for it, such as the certificate's. All code
+that a solve can need is compiled together, before the solve begins. Code that its parts share is compiled once.
 
 `smoother_iterations`, `ilqr_iterations` and `descend` run the iterations `first` to `stop` - 1, and can be called again
 to continue, because their state is in their arrays. The log gets a row per iteration. They return four values: the
@@ -30,7 +29,6 @@ reach 0 is also used, each time for twice as long.
 
 from math import inf, isnan, nan
 
-from lqrsim.kernels.active_set import active_set as active_set
 from lqrsim.kernels.certificate import certify, reduced_curvature
 from lqrsim.kernels.declarations import (
     CERTIFY,
@@ -67,7 +65,6 @@ from lqrsim.kernels.declarations import (
     stack,
     zeros,
 )
-from lqrsim.kernels.interior_point import interior_point as interior_point
 from lqrsim.kernels.linear_algebra import copy, fill
 from lqrsim.kernels.passes import (
     backward_pass,
@@ -87,16 +84,8 @@ from lqrsim.kernels.passes import (
     smoothed_states,
     towards,
 )
-from lqrsim.kernels.passes import lq_passes as lq_passes
 from lqrsim.kernels.passes import opening_pass as opening_pass
 from lqrsim.kernels.records import CostToGo, Descent, Linearization, ModelOrder, Policy, Prior, ProblemModel
-from lqrsim.kernels.restoration import restoration as restoration
-from lqrsim.kernels.stages import adjoint as adjoint
-from lqrsim.kernels.stages import determine_scales as determine_scales
-from lqrsim.kernels.stages import evaluate_plan as evaluate_plan
-from lqrsim.kernels.stages import least_curvatures as least_curvatures
-from lqrsim.kernels.stages import read_rows as read_rows
-from lqrsim.kernels.stages import write_models as write_models
 
 # A small change of cost can come from a short step, so two in a row are required. At a kink of the dynamics damped
 # steps may lower the merit by rounding for ever.

@@ -15,7 +15,7 @@ from lqrsim.codegen.compiled_module import CompiledModule, in_c_order, module_of
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import numbers_of
 from lqrsim.errors import Array
-from lqrsim.kernels import augmented_lagrangian, iterations, linear_algebra, model_functions, records
+from lqrsim.kernels import augmented_lagrangian, iterations, linear_algebra, model_functions, passes, records
 from lqrsim.kernels.declarations import FIRST, MARGIN, MULTIPLIERS, PENALTY, PRICE, ROWS
 from lqrsim.kernels.records import CostModel, DynamicsModel, Motion, NoiseModel, Policy, ProblemModel
 from lqrsim.problem.dynamics import Dynamics
@@ -39,7 +39,7 @@ def core(problem: Problem, form: str = "dual") -> CompiledModule:
 def linear_quadratic(n: int, m: int, form: str) -> CompiledModule:
     """The compiled passes for linear-quadratic problems of that size; see `lq_passes` of `kernels/passes.py`."""
     description = f"linear-quadratic problems, {n} states and {m} controls"
-    return module_of(source_of(iterations), description, N=n, M=m, NOISY=0, PRIMAL=int(form == "primal"))
+    return module_of(source_of(passes), description, N=n, M=m, NOISY=0, PRIMAL=int(form == "primal"))
 
 
 def _sizes(dynamics: Dynamics) -> dict[str, int]:

@@ -15,11 +15,11 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from lqrsim.codegen.compiled_module import Call, in_c_order, module_of
+from lqrsim.codegen.compiled_module import Call, CompiledModule, in_c_order, module_of
 from lqrsim.codegen.sources import source_of
 from lqrsim.codegen.user_functions import interrupt_of
 from lqrsim.errors import Array
-from lqrsim.kernels import active_set, iterations, records
+from lqrsim.kernels import active_set, interior_point, records, restoration
 from lqrsim.kernels.declarations import CONVERGED, NO_PROGRESS, NOT_FINITE, RUNNING
 from lqrsim.kernels.interior_point import BEGIN, CLOSE, FLAT_BEFORE_END, ITERATE, LATELY, POLISH, SCALE
 from lqrsim.kernels.records import Motion, StructuredArray, zeros_of
@@ -87,7 +87,6 @@ class Stages:
         self._shape = n, m, steps, counts, lower, upper = _shape(problem)
         rows, self.n, self.m = sum(counts) + len(lower) + len(upper), n, m
         self._lengths = {"T": steps, "N": n, "M": m, "W": n + m, "R": rows, "K": (steps + 1) * rows, "C": len(counts)}
-        self._module = module_of(source_of(iterations), f"stages of {n} states and {m} controls", N=n, M=m)
         self._calls: dict[str, Call] = {}
         stage_rows = zeros_of(records.StageRows, {"size": rows}, **self._lengths)
         stage_rows.limits[...], stage_rows.first[...] = np.inf, np.cumsum([0, *counts])[:-1]
@@ -173,7 +172,7 @@ class Stages:
         arrays, memory = self.interior
         begun = records.PlanBeginning(plan, about.rows.force, False, 0.0, 0.0, 0.0)
         costates, slopes = about.to_go.gradient, plan.controls
-        self._module.prepare(
+        self._module("interior_point").prepare(
             interior_point=(0, 0, 0, 0.0, 0.0, begun, about, arrays, memory, np.zeros(0, records.MEASURES)),
             determine_scales=(about, plan), write_models=(True, about, plan, costates, 0.0),
             adjoint=(about, costates, slopes), evaluate_plan=(about, plan, about.models.arrived),
@@ -181,10 +180,15 @@ class Stages:
             least_curvatures=(about, about.rows.force, slopes, slopes[0]),
         )  # fmt: skip
 
+    def _module(self, name: str) -> CompiledModule:
+        """The kernels of a method; those of the interior point have what others need, too."""
+        kernel = {"active_set": active_set, "restoration": restoration}.get(name, interior_point)
+        return module_of(source_of(kernel), f"stages of {self.n} states and {self.m} controls", N=self.n, M=self.m)
+
     def call(self, name: str, *arguments: Any) -> Any:
         """Call a compiled function, reusing the layout of its arguments."""
         if name not in self._calls:
-            self._calls[name] = self._module.lay_out(name, *arguments)
+            self._calls[name] = self._module(name).lay_out(name, *arguments)
         return self._calls[name](*arguments)
 
     def values(self, plan: Motion) -> Array:
