@@ -1,12 +1,12 @@
 """Obstacles that move: plans for where they will be, against places, velocities and SLSQP; see `point_mass.py`."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
+from live_solves import ready
 from point_mass import DT, MARGIN, RADIUS, Oracle, balls, check, problem
 from sampling import examples
 
@@ -103,13 +103,6 @@ class TestPlans:
         assert found[0].cost == pytest.approx(oracle.cost(oracle.pack(found[0].trajectory)), rel=1e-9)
         for one, other in zip(stated.constraint_terms, same.constraint_terms, strict=True):
             np.testing.assert_allclose(one.data, other.data, rtol=0, atol=1e-9)
-
-
-def ready(planner: ls.types.LiveReplanner) -> None:
-    """Wait for the answer that the planner's thread is at."""
-    solve = planner._solve
-    while solve is not None and solve.answer is None and solve.error is None:
-        time.sleep(1e-3)
 
 
 class TestReplanner:

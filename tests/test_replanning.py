@@ -11,6 +11,7 @@ import pytest
 from funnels_by_hand import funnel_by_hand
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from live_solves import ready
 from point_mass import MARGIN, RADIUS, Oracle, balls, problem
 from sampling import examples
 
@@ -472,12 +473,6 @@ def live(stated: ls.Problem, solution: ls.Solution, *, clock: Any, **options: An
     """With a horizon that moves along, if no other is asked for."""
     chosen: dict[str, Any] = {"horizon": "moving"} | options
     return ls.Replanner(stated, solution, **chosen).live(clock=clock)
-
-
-def ready(planner: ls.types.LiveReplanner) -> None:
-    """Wait for the answer that the planner's thread is at."""
-    if planner._solve is not None:
-        planner._solve[1].exception()
 
 
 @pytest.mark.parametrize("cost", [1.0, np.float64(1.0), np.inf, np.float64("inf"), np.nan, np.float64("nan")])

@@ -14,6 +14,7 @@ import browsing
 import mujoco
 import numpy as np
 import pytest
+from live_solves import ready
 from mechanisms import sled
 from planar_arm import LENGTH, LINK, PlanarArm
 from viewers import Recorder, said, said_after, viewing
@@ -39,12 +40,6 @@ def count_from_here() -> None:
 def planning() -> list[threading.Thread]:
     threads = [thread for thread in threading.enumerate() if thread.name.startswith("lqrsim re-planner")]
     return [thread for thread in threads if thread not in BEFORE]
-
-
-def wait_for(planner: ls.types.LiveReplanner) -> None:
-    """For the answer that its thread is at."""
-    if planner._solve is not None:
-        planner._solve[1].exception()
 
 
 class Run:
@@ -74,7 +69,7 @@ class Run:
         for one in self.acts:
             one(time)
         if self.patient:
-            wait_for(self.planners[-1])
+            ready(self.planners[-1])
 
     def planner(self) -> ls.types.LiveReplanner:
         replanner = ls.Replanner(self.scenario.problem, self.solution, **self.options)
@@ -178,7 +173,7 @@ def test_what_is_not_ready_is_missed_and_the_run_goes_on(
     def release(time: float) -> None:
         if time > 0.99:
             held.set()
-            wait_for(run.planners[-1])
+            ready(run.planners[-1])
 
     run.acts.append(release)
     run.go()
@@ -335,7 +330,7 @@ def test_a_robot_without_a_position_plans_again(tmp_path: Path) -> None:
         return made[-1]
 
     screen = Recorder(120, **viewer.arguments_for_plant(plant, solution))
-    screen.act = lambda time: wait_for(made[-1])
+    screen.act = lambda time: ready(made[-1])
     viewer.live(plant, solution, screen, planner=planner)
     assert screen.hold(screen.other()) == screen.robot
     (planner_made,) = made
