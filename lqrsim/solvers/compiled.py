@@ -137,7 +137,7 @@ def _constraint_functions(constraints: tuple[tuple[Source, int, bool, bool], ...
 
 
 def noise_module(problem: Problem, term: NoiseTerm) -> CompiledModule:
-    """The compiled noise of a problem; see `kernels/noise.py`."""
+    """The compiled noise of a problem; see `problem/noise.py`."""
     return module_of(term.code, "noise", **_sizes(problem.dynamics))
 
 
