@@ -98,7 +98,7 @@ def refine(run: SolveRun, known: Known) -> RunResult:
         return result
     result = replace(result, missed=result.violation)
     known.evidence.append(result)
-    return replace(result, status=Status.INFEASIBLE) if result in alike(known.evidence) else result
+    return replace(result, status=Status.INFEASIBLE) if result in _alike(known.evidence) else result
 
 
 def from_states(run: SolveRun, known: Known) -> RunResult:
@@ -504,7 +504,7 @@ class ConstrainedRun(InteriorRun):
         def is_stationary(plan: Motion, shares: list[Array], sizes: Sizes) -> bool:
             """Whether the violation of a plan is; if so, the plan is kept as evidence."""
             result = self.result(plan)
-            new = evidence(run, result, shares, sizes) if result.violation > EVIDENT * self._allowed else None
+            new = _evidence(run, result, shares, sizes) if result.violation > EVIDENT * self._allowed else None
             self._known.evidence += [] if new is None else [new]
             return new is not None
 
@@ -561,7 +561,7 @@ class ConstrainedRun(InteriorRun):
             lagrangian.evaluate(best.plan)
             status = Status.STALLED if self._budget.left > 1 else Status.MAX_ITERATIONS
             detail = lagrangian.worst()
-            if best.violation > self._allowed and (same := alike(self._known.evidence)):
+            if best.violation > self._allowed and (same := _alike(self._known.evidence)):
                 best = same[0]
                 lagrangian.evaluate(best.plan)
                 detail = lagrangian.worst()
@@ -573,14 +573,14 @@ class ConstrainedRun(InteriorRun):
         return best if best.certificate is not None else run.certified(best)
 
 
-def alike(cases: Sequence[RunResult]) -> list[RunResult]:
+def _alike(cases: Sequence[RunResult]) -> list[RunResult]:
     """The evidence with equally small violations, the least first; empty unless it is from `STARTS` starts."""
     least = sorted(cases, key=lambda case: case.missed)
     same = [case for case in least if case.missed <= (1 + ALIKE) * least[0].missed]
     return same if len(same) >= STARTS else []
 
 
-def evidence(run: SolveRun, plan: RunResult, shares: list[Array], sizes: Sizes) -> RunResult | None:
+def _evidence(run: SolveRun, plan: RunResult, shares: list[Array], sizes: Sizes) -> RunResult | None:
     """A plan for the problem of a run with what it is evidence of, or None.
 
     The total violation, each row relative to its size, has a gradient in the controls. It is recomputed here from the

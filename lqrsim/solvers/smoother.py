@@ -357,7 +357,7 @@ def solve_fixed(problem: Problem, settings: SmootherSettings, stop: Stop, *, tre
     """Solve a problem of fixed duration, and again with constraints that the plan misses within its periods refined."""
     stated, original, log = problem, settings, tuple[Iteration, ...]()
     if any(constraint._rough for constraint in problem.constraints):
-        problem, settings, log = outlined(problem, settings, stop)
+        problem, settings, log = _outlined(problem, settings, stop)
     refinements, preliminary, by_outline = REFINEMENTS, settings is not original, problem is not stated
     while True:
         solution = Search(problem, settings, stop).solve(trees=trees)
@@ -369,7 +369,7 @@ def solve_fixed(problem: Problem, settings: SmootherSettings, stop: Stop, *, tre
             solution.status in (Status.INFEASIBLE, Status.STALLED) and np.isfinite(solution.trajectory.states).all()
         )
         if failed and by_outline and not stop.due:  # no plan may keep the constraints as they are along the outline
-            problem, settings, _ = outlined(stated, replace(original, start=solution.trajectory, starts=None), stop)
+            problem, settings, _ = _outlined(stated, replace(original, start=solution.trajectory, starts=None), stop)
             by_outline = False
             continue
         allowed = original.violation_tolerance(problem)
@@ -380,7 +380,7 @@ def solve_fixed(problem: Problem, settings: SmootherSettings, stop: Stop, *, tre
         refinements, preliminary, by_outline = refinements - 1, False, False
 
 
-def outlined(
+def _outlined(
     problem: Problem, settings: SmootherSettings, stop: Stop
 ) -> tuple[Problem, SmootherSettings, tuple[Iteration, ...]]:
     """The problem with constraints refined along an outline, the settings for a plan to refine them again; iterations.

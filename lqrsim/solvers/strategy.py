@@ -5,8 +5,8 @@ one start. The budget of each start is `max_iterations`; all starts share one de
 certified (`certify.py`).
 
 Some goals no control comes nearer to: the change of a state with every control of a plan is zero. Such a plan is
-stationary, but says nothing: a box that nothing touches does not move, whatever the weight of its place. `unmoved`
-finds such states, and `Search.push_and_approach` plans that change them.
+stationary, but says nothing: a box that nothing touches does not move, whatever the weight of its place.
+`Search.push_and_approach` looks for plans that change them.
 """
 
 import contextlib
@@ -386,7 +386,7 @@ class Search:
         def consider(name: str, begin: Start, plan: Motion) -> bool:
             """Keep a plan that changes these states; return whether it takes them nearer to their goal at less cost."""
             cost = compiled.cost_of(problem, *plan)
-            if not (np.isfinite(cost) and differ(plan, before, places)):
+            if not (np.isfinite(cost) and _differ(plan, before, places)):
                 return False
             nearer = self._comes_nearer(plan)
             plans.append((not nearer, cost, name, begin))
@@ -394,7 +394,7 @@ class Search:
 
         for name, controls, plan in multistart.pushes(problem):
             consider(name, controls, plan)
-        for name, through in approaches(problem, before, places):
+        for name, through in _approaches(problem, before, places):
             if self._stop.due:
                 break
             drawn = self._finish(self._another(None, through), refine, most=APPROACH).kept()
@@ -420,7 +420,7 @@ class Search:
         if self._still is None or not np.isfinite(plan.states[-1]).all():
             return False
         first, places = self._still
-        now, before = (missing(self._problem, motion.states[-1], places) for motion in (plan, first))
+        now, before = (_missing(self._problem, motion.states[-1], places) for motion in (plan, first))
         return bool(np.linalg.norm(now) < (1 - NEARER) * np.linalg.norm(before))
 
     def _is_better(self, result: RunResult) -> bool:
@@ -460,8 +460,8 @@ class Search:
     def keep_given(self, given: RunResult) -> None:
         """If the best plan is worse than the caller's, or has left what that moved, descend from the caller's plan."""
         run, best = self.best
-        still = differ(best, given, self._unmoved())
-        worsened = still or run.is_worse(best, given) or goal_left(self._problem, best, given)
+        still = _differ(best, given, self._unmoved())
+        worsened = still or run.is_worse(best, given) or _goal_left(self._problem, best, given)
         if worsened and not self._stop.due:
             run = self._add(guess_from(given, "descent from the given plan"))
             other = self._finish(run, refine)
@@ -806,12 +806,12 @@ def guess_from(result: RunResult, summary: str) -> InitialGuess:
     return InitialGuess(result.law.gain.copy(), result.law.offset.copy(), summary)
 
 
-def differ(plan: RunResult | Motion, other: RunResult | Motion, places: list[int]) -> bool:
+def _differ(plan: RunResult | Motion, other: RunResult | Motion, places: list[int]) -> bool:
     """Whether two plans end with different values of these states."""
     return bool((np.abs(plan.states[-1] - other.states[-1])[places] > NONE).any())
 
 
-def goal_left(problem: Problem, result: RunResult, baseline: RunResult) -> bool:
+def _goal_left(problem: Problem, result: RunResult, baseline: RunResult) -> bool:
     """Whether a plan has gone farther from the goal than a given one, to where the final cost has no slope."""
     value, slope, _ = _final_cost(problem, result.states[-1])
     before, steeper, _ = _final_cost(problem, baseline.states[-1])
@@ -826,7 +826,7 @@ def _final_cost(problem: Problem, state: Array) -> tuple[float, Array, Array]:
     return value, gradient[:n], hessian[:n, :n]
 
 
-def missing(problem: Problem, state: Array, places: list[int]) -> Array:
+def _missing(problem: Problem, state: Array, places: list[int]) -> Array:
     """By how much these states of a final state (n,) are short of the goal, (n,); zero for all others."""
     shortfall, (_, slope, curvature) = np.zeros(len(state)), _final_cost(problem, state)
     shortfall[places] = -np.linalg.lstsq(curvature[np.ix_(places, places)], slope[places])[0]
@@ -835,13 +835,13 @@ def missing(problem: Problem, state: Array, places: list[int]) -> Array:
     return shortfall
 
 
-def approaches(problem: Problem, result: RunResult, places: list[int]) -> Iterator[tuple[str, Problem]]:
+def _approaches(problem: Problem, result: RunResult, places: list[int]) -> Iterator[tuple[str, Problem]]:
     """Problems in which the robot passes through a body that nothing touches, and is drawn along motions that take the
     body to its goal, in words. Their solutions are starts in which the robot touches the body, whose own goals are left
     out of the constraints, as it does not move there.
     """
     constraints = [part for part in problem.constraints if not part.final_states(problem.dynamics)]
-    shortfall = missing(problem, result.states[-1], places)
+    shortfall = _missing(problem, result.states[-1], places)
     for words, dynamics, about in problem.dynamics.approaches(result.states, shortfall):
         drawn = ~np.isnan(about)
         ways = np.where(drawn, about, -np.inf).max(axis=0) - np.where(drawn, about, np.inf).min(axis=0)
