@@ -25,10 +25,11 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 GL_PACKAGES = ("libegl1", "libgl1-mesa-dri", "libopengl0")
 ARM_PACKAGES = ("gcc-arm-none-eabi", "libnewlib-arm-none-eabi", "qemu-system-arm")
 
-# All but the tests of packages, which are a third of what there is and are not run.
-COMPILE = """
+# All but the tests of packages, which are a third of what there is and are not run, and packages of which little is.
+COMPILE = r"""
 import compileall, re, sysconfig
-compileall.compile_dir(sysconfig.get_path("purelib"), rx=re.compile(r"[/\\\\]tests?[/\\\\]"), quiet=2, workers=0)
+rest = re.compile(r"[/\\](tests?|OpenGL|pip|plotly)[/\\]")
+compileall.compile_dir(sysconfig.get_path("purelib"), rx=rest, quiet=2, workers=0)
 """
 
 COMMANDS = {
