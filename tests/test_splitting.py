@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mechanisms import motors, sled
 from sampling import is_short, rarely
 from scipy import stats
 
@@ -338,29 +339,16 @@ def test_scores_that_all_tie_are_named(floor: float) -> None:
     assert refused.value.trials == 0
 
 
-DOCKED = """
-<mujoco>
-  <option timestep="0.025" integrator="Euler" gravity="0 0 0"/>
-  <worldbody>
-    <geom name="dock" type="cylinder" size="0.1 0.1" pos="{dock} 0 0.07"/>
-    <geom name="pillar" type="cylinder" size="0.15 0.1" pos="0.6 -0.4 0.07"/>
-    <body name="my_robot">
-      <joint name="slide_x" type="slide" axis="1 0 0" damping="0.2"/>
-      <joint name="slide_y" type="slide" axis="0 1 0" damping="0.2"/>
-      <geom type="cylinder" size="0.1 0.03" mass="0.5"/>
-    </body>
-  </worldbody>
-  <actuator>
-    <motor name="push_x" joint="slide_x" ctrlrange="-2 2"/>
-    <motor name="push_y" joint="slide_y" ctrlrange="-2 2"/>
-  </actuator>
-</mujoco>
-"""
-
-
 def docked(gap: float, folder: Path) -> tuple[ls.Plant, ls.Solution]:
     """A disc that starts at this distance from its dock, and passes a pillar at 0.15 m."""
-    (folder / "docked.xml").write_text(DOCKED.format(dock=-1.2 - gap), encoding="utf-8")
+    text = sled(
+        "xy", name="my_robot", names=("slide_x", "slide_y"), joint='damping="0.2"',
+        geom='type="cylinder" size="0.1 0.03" mass="0.5"', option='timestep="0.025" integrator="Euler" gravity="0 0 0"',
+        things=f"""<geom name="dock" type="cylinder" size="0.1 0.1" pos="{-1.2 - gap} 0 0.07"/>
+          <geom name="pillar" type="cylinder" size="0.15 0.1" pos="0.6 -0.4 0.07"/>""",
+        actuators=motors(("slide_x", "slide_y"), (2, 2)).replace('name="slide', 'name="push'),
+    )  # fmt: skip
+    (folder / "docked.xml").write_text(text, encoding="utf-8")
     robot, scene = MyRobot(), ls.load_scene(folder / "docked.xml")
     problem = ls.Problem(
         dynamics=robot.dynamics, dt=0.1, steps=40, initial=ls.FixedState((-1.0, 0.0, 0.0, 0.0)),

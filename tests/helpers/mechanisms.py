@@ -69,6 +69,7 @@ def sled(
     axes: str = "x",
     *,
     name: str = "sled",
+    names: Sequence[str] = (),
     joint: str = "",
     geom: str = 'type="sphere" size="0.1" mass="1"',
     place: str = "0 0 0",
@@ -78,13 +79,17 @@ def sled(
     things: str = "",
     more: str = "",
 ) -> str:
-    """A body, with a geom of the same name, that slides along these axes, whose names its joints and motors have."""
+    """A body, with a geom of the same name, that slides along these axes.
+
+    Joints have these names, by default those of the axes, and so have motors.
+    """
+    names = names or tuple(axes)
     slides = "".join(
-        f'<joint name="{axis}" type="slide" axis="{" ".join("01"[axis == one] for one in "xyz")}" {joint}/>'
-        for axis in axes
+        f'<joint name="{own}" type="slide" axis="{" ".join("01"[axis == one] for one in "xyz")}" {joint}/>'
+        for own, axis in zip(names, axes, strict=True)
     )
     body = f'<body name="{name}" pos="{place}">{slides}<geom name="{name}" {geom}/></body>'
-    return scene(body, actuators or motors(axes, limits), option=option, things=things, more=more)
+    return scene(body, actuators or motors(names, limits), option=option, things=things, more=more)
 
 
 # A free body with a ball joint and a hinge: its links move in other coordinates than MuJoCo's. {link} is the last
