@@ -194,13 +194,13 @@ def places_jacobian(x, data, out, slopes) -> None:
 
 
 def noise_values(x, u, data, out) -> None:
-    """Write the rows of M(x, u) that `noise.py` lists: `user_functions.py`, `constant_values` of `noise.py`."""
+    """Write the rows of M(x, u) that `problem/noise.py` lists: `constant_values` there, and `user_functions.py`."""
 
 
 def noise_slopes(x, u, data, out, slopes) -> None:
-    """Write these rows, and their derivatives, column by column, in the entries of (x, u) that `noise.py` lists.
+    """Write these rows, and their derivatives, column by column, in the entries of (x, u) that are listed there.
 
-    `differences.py`, `constant_slopes` of `noise.py`.
+    `constant_slopes` there, and `differences.py`.
     """
 
 

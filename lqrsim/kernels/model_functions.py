@@ -166,7 +166,7 @@ def slope_of_constraint(which, row, x, u, t, constraints, gradient):
 
 
 def noise_value(x, u, t, noise, next_step):
-    """The expected cost of noise at (x, u); see `noise.py`.
+    """The expected cost of noise at (x, u); see `problem/noise.py`.
 
     The cost-to-go that weighs it is that of `next_step`, the rest of the problem after step t; or, with constraints, a
     given one.
