@@ -351,7 +351,7 @@ def drive(scenario: ls.Scenario, *, compass: bool = False, **changed: Any) -> ls
     sensors = ls.belief.NoisySensors(beacons, parameters={"left": -2.0, "noise": 0.05}, delay=1)
     noise, known = ls.Noise(0.01 * np.eye(3)), ("x", "y") if compass else None
     of = ls.belief.Belief(scenario.robot.dynamics, dt=DT, noise=noise, sensors=sensors, uncertain=known)
-    covariance = START * np.outer(*[[1, 1, not compass]] * 2) / 10
+    covariance = np.pad(START[:2, :2], (0, 1)) / 10 if compass else START / 10
     given: dict[str, Any] = {
         "dt": DT, "steps": 20, "initial": ls.FixedState(of.state([-0.9, -2.4, 0.0], covariance)),
         "stage_cost": ls.ControlCost([1.0, 1.0]), "noise": of.innovations,
