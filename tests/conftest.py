@@ -56,7 +56,7 @@ def fewer_trials_of_predictions(pytestconfig: pytest.Config) -> Iterator[None]:
 # The slowest files start first: a file is not divided among processors, and one that starts last keeps all waiting.
 # In this order the first three files do not compile the same code at the same time.
 LONGEST = (
-    "kernels", "campaign", "process", "render", "whole_problems", "mjcf_robot", "verify", "json", "cli", "docs",
+    "kernels", "campaign", "mjcf_robot", "process", "render", "whole_problems", "verify", "json", "cli", "docs",
     "free_duration", "parking", "robustness_api", "hardening", "belief", "failure_commands", "hulls", "funnel", "plots",
     "mjcf_distances", "between_knots", "experiments", "given_solutions", "files", "endings", "closed_loop", "gym",
     "interior_point", "noise", "urdf", "disturbances_all", "league", "cache", "ways", "smoother", "tracking", "levels",
