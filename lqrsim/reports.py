@@ -160,10 +160,8 @@ def report(
             page["videos"].append(_video(results, trial, problem, Path(folder)))
             tell(3 + number, parts)
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    template = environment.from_string(
-        packaged("lqrsim.templates").joinpath("page.html.j2").read_text(encoding="utf-8")
-    )
-    write_text(path, template.render(page))
+    template = packaged("lqrsim.templates").joinpath("page.html.j2").read_text(encoding="utf-8")
+    write_text(path, environment.from_string(template).render(page))
     tell(parts, parts)
     return path
 
