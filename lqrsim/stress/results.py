@@ -135,6 +135,7 @@ class Results:
         deterministic = not cell.strength or [cell.sweep, cell.strength] in self.manifest["deterministic"]
         found = Outcomes(**columns, deterministic=deterministic)
         reasons = Counter(reason for table in tables for reason in table["reason"].tolist() if reason)
+        # What a summary says of them, so that it reads no table again.
         self._known[cell] = _SoFar(shards, Counter(found.outcome.tolist()), reasons, analysis.success(cell, found))
         return found
 
