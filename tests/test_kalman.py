@@ -17,7 +17,7 @@ from scipy.linalg import expm
 from scipy.stats import binom, chi2
 
 import lqrsim as ls
-from lqrsim.control.kalman import PLAUSIBLE, RESOLUTION, kalman_filter
+from lqrsim.control.offset_free import PLAUSIBLE, RESOLUTION, kalman_filter
 from lqrsim.control.plan_model import PlanModel
 from lqrsim.control.uncertainty import triangular_root
 from lqrsim.disturbances import Uncertainty, Unknown

@@ -13,8 +13,7 @@ from sampling import examples
 from tracking import hover
 
 import lqrsim as ls
-from lqrsim.control.kalman import SensorFilter
-from lqrsim.control.offset_free import SensorRun
+from lqrsim.control.offset_free import SensorFilter, SensorRun
 from lqrsim.disturbances import (
     ControlNoise,
     Disturbance,

@@ -16,8 +16,7 @@ from scipy.linalg import expm
 from sympy import cos, exp, sin
 
 import lqrsim as ls
-from lqrsim.control.kalman import kalman_filter
-from lqrsim.control.offset_free import with_filter
+from lqrsim.control.offset_free import kalman_filter, with_filter
 from lqrsim.control.plan_model import PlanModel, recursions
 from lqrsim.control.prediction import LinearLoop
 from lqrsim.control.tracking import Laws, Weights, tracking_laws
