@@ -255,14 +255,14 @@ class Plant(OneVersion):
             anchors, radii = np.array([[number, *place]]), np.array([radius])
 
             def centres(states: Array) -> Array:
-                found = [data.xpos[number] + data.xmat[number].reshape(3, 3) @ place for data in self.posed(states)]
+                found = [data.xpos[number] + data.xmat[number].reshape(3, 3) @ place for data in self._posed(states)]
                 return np.reshape(found, (-1, 1, 3))
 
         places = np.full((*driven.shape[:2], len(radii), 3), np.nan)
         places[known] = centres(driven[known])
         return BallRecord(driven=places, planned=centres(planned), radii=radii, anchors=anchors)
 
-    def posed(self, states: Array) -> Iterator[mujoco.MjData]:
+    def _posed(self, states: Array) -> Iterator[mujoco.MjData]:
         """MuJoCo's data with the places of all bodies in each of these states (k, n): one object, which changes."""
         positions = np.tile(self.model.qpos0, (len(states), 1))
         for position, state in zip(positions, states, strict=True):
@@ -315,10 +315,10 @@ def extent(plant: Plant) -> float:
     axes = [0, 1] if space.from_above else [0, 1, 2]  # axes of the world that count for distances
     states = np.random.default_rng(0).standard_normal((9, len(space)))
     states[-1] = 0.0
-    for state, data in zip(states, plant.posed(states), strict=True):
+    for state, data in zip(states, plant._posed(states), strict=True):
         place = space.in_world(state[list(space.position)])
         off = max(off, float(np.linalg.norm((data.xpos[plant.body] - place)[axes])))
-    at_zero = next(plant.posed(states[-1:]))
+    at_zero = next(plant._posed(states[-1:]))
     obstacles = [model.geom(name).id for name in plant.obstacles]
     thick = model.geom_margin + model.geom_gap  # distance at which MuJoCo detects a contact
     thickest = max(thick[obstacles].max(initial=0.0), (model.pair_margin + model.pair_gap).max(initial=0.0))
@@ -470,7 +470,7 @@ def _check_position(plant: Plant) -> None:
     robot, space, n = plant.robot, plant.robot.dynamics.state_coordinates, len(plant.robot.dynamics.state_coordinates)
 
     def origins(states: Array) -> Array:
-        return np.array([data.xpos[plant.body].copy() for data in plant.posed(states)])
+        return np.array([data.xpos[plant.body].copy() for data in plant._posed(states)])
 
     # About a state without zeros, so that angles have an effect.
     middle, steps = 0.1 + 0.01 * np.arange(n), np.eye(n)[list(space.position)]
@@ -523,7 +523,7 @@ def _check_sites(plant: Plant, balls: CollisionSpheres) -> None:
     anchors = [(k, site, anchor_of(model, site)) for k, site in enumerate(balls.sites) if site is not None]
     drawn = np.random.default_rng(0).uniform(-1.0, 1.0, (3, n))
     states = np.array([np.zeros(n), 0.1 + 0.01 * np.arange(n), *drawn])
-    for state, data in zip(states, plant.posed(states), strict=True):
+    for state, data in zip(states, plant._posed(states), strict=True):
         centres = balls.centres(dynamics, state) if anchors else ()
         for k, site, (body, *place) in anchors:
             position = data.xpos[int(body)] + data.xmat[int(body)].reshape(3, 3) @ place
