@@ -53,21 +53,15 @@ ARM = mechanisms.arm(
 )  # fmt: skip
 UPPER = '<body name="upper" pos="0 0 0">'
 
-CART_POLE = """<mujoco>
-  <option timestep="0.01" integrator="RK4"/>
-  <worldbody>
-    <geom name="floor" type="plane" size="9 9 0.1" pos="0 0 -0.2"/>
-    <body name="cart">
-      <joint name="slide" type="slide" axis="1 0 0"/>
-      <geom type="box" size="0.1 0.1 0.05" mass="1" contype="0" conaffinity="0"/>
-      <body name="pole">
-        <joint name="hinge" type="hinge" axis="0 1 0"/>
-        <geom type="capsule" fromto="0 0 0.1 0 0 0.6" size="0.02" mass="0.1"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator><motor name="push" joint="slide" ctrlrange="-20 20"/></actuator>
-</mujoco>"""
+
+def cart_pole(axes: str = "x", *, floor: float = -0.2, things: str = "") -> str:
+    return mechanisms.sled(
+        axes, name="cart", geom=f'type="box" size="0.1 0.1 0.05" mass="1" {mechanisms.NO_CONTACT}',
+        carried="""<body name="pole"><joint name="hinge" axis="0 1 0"/>
+          <geom type="capsule" fromto="0 0 0.1 0 0 0.6" size="0.02" mass="0.1"/></body>""",
+        actuators=mechanisms.motors("x", (20,)), option='timestep="0.01" integrator="RK4"',
+        things=f'<geom name="floor" type="plane" size="9 9 0.1" pos="0 0 {floor}"/>{things}',
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -89,8 +83,8 @@ class Arm(Jointed):
 class CartPole(Jointed):
     name = "cart_pole"
     body = "cart"
-    joints = ("slide", "hinge")
-    actuators = ("push",)
+    joints = ("x", "hinge")
+    actuators = ("x",)
 
     @cached_property
     def dynamics(self):  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -380,7 +374,7 @@ def test_an_arm_that_gets_there_has_reached_it_and_one_that_does_not_has_not(arm
 
 
 def test_a_cart_pole_that_has_fallen_has_not_reached_its_goal() -> None:
-    plant = Plant(CartPole(), scene_from_xml(CART_POLE.replace("0 0 -0.2", "0 0 -0.7"), "rail"))  # out of reach
+    plant = Plant(CartPole(), scene_from_xml(cart_pole(floor=-0.7), "rail"))  # out of reach
     plan = track(plant.robot, np.zeros(4), np.zeros((25, 1)), 0.05)
     plan = replace(plan, goal=np.zeros(4))
     held = ls.simulate(plant, plan, disturbances=[InitialStateError((0, 0.02, 0, 0))])
@@ -394,7 +388,7 @@ def test_a_cart_pole_that_has_fallen_has_not_reached_its_goal() -> None:
 
 @pytest.mark.parametrize("contacts", [True, False])
 def test_the_floor_is_an_obstacle_of_what_cannot_stand_on_it(contacts: bool) -> None:
-    plant = Plant(CartPole(), scene_from_xml(CART_POLE, "rail"))
+    plant = Plant(CartPole(), scene_from_xml(cart_pole(), "rail"))
     assert plant.obstacles == ("floor",)
     plan = track(plant.robot, np.zeros(4), np.zeros((60, 1)), 0.05)
     fallen = ls.simulate(plant, plan.open_loop(), disturbances=[InitialStateError((0, 0.02, 0, 0))], contacts=contacts)
@@ -409,12 +403,9 @@ def test_the_floor_is_an_obstacle_of_what_cannot_stand_on_it(contacts: bool) -> 
 
 
 def test_what_can_sink_to_the_floor_stands_on_it() -> None:
-    slide = '<joint name="slide" type="slide" axis="1 0 0"/>'
-    lifted = CART_POLE.replace(slide, slide + '<joint name="up" type="slide" axis="0 0 1"/>')
-
     @dataclass(frozen=True)
     class Lifted(CartPole):
-        joints = ("slide", "up", "hinge")
+        joints = ("x", "z", "hinge")
 
         def state(self, qpos, qvel, near=None):
             return super().state(qpos[..., [0, 2]], qvel[..., [0, 2]], near)
@@ -423,10 +414,9 @@ def test_what_can_sink_to_the_floor_stands_on_it() -> None:
             qpos, qvel = (np.insert(part, 1, 0.0, axis=-1) for part in super().configuration(state))
             return qpos, qvel
 
-    assert Plant(Lifted(), scene_from_xml(lifted, "rail")).obstacles == ()
+    assert Plant(Lifted(), scene_from_xml(cart_pole("xz"), "rail")).obstacles == ()
     ceiling = '<geom name="ceiling" type="plane" size="9 9 0.1" pos="0 0 2" euler="180 0 0"/>'
-    between = lifted.replace("<worldbody>", f"<worldbody>{ceiling}")
-    assert Plant(Lifted(), scene_from_xml(between, "rail")).obstacles == ("ceiling",)
+    assert Plant(Lifted(), scene_from_xml(cart_pole("xz", things=ceiling), "rail")).obstacles == ("ceiling",)
 
 
 # Judged by the goal.

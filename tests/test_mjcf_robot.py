@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from mechanisms import arm, motors, sled
+from mechanisms import NO_CONTACT, arm, motors, sled
 from sampling import examples, rarely
 from scipy.spatial.transform import Rotation
 
@@ -826,9 +826,6 @@ def five_bar(rng: np.random.Generator, tie: str = "connect") -> str:
       </actuator><compiler autolimits="true"/></mujoco>"""
 
 
-NO_CONTACT = 'contype="0" conaffinity="0"'
-
-
 @pytest.mark.parametrize("tie", ["connect", "sites"])
 @settings(max_examples=1)
 @given(seed=SEEDS)
@@ -1345,15 +1342,6 @@ def test_a_load_that_hangs_from_a_winch_is_at_rest() -> None:
     np.testing.assert_allclose(data.qpos, robot.configuration(state)[0], rtol=0, atol=1e-6)
 
 
-DRY = """<mujoco model="dry"><option timestep="0.005" integrator="implicitfast"/><compiler autolimits="true"/>
-  <worldbody><body><joint name="way" type="slide" axis="1 0 0" frictionloss="LOSS"/>
-  <geom type="box" size="0.1 0.1 0.1" mass="MASS" contype="0" conaffinity="0"/><body>
-  <joint name="turn" axis="0 1 0" damping="0.1" frictionloss="0.05" armature="0.05"/>
-  <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="0.2" contype="0" conaffinity="0"/></body></body>
-  </worldbody><actuator><motor joint="way" gear="10" ctrlrange="-1 1"/><motor joint="turn" gear="2" ctrlrange="-1 1"/>
-  </actuator></mujoco>"""
-
-
 @settings(max_examples=examples(8))
 @given(mass=st.floats(0.3, 3.0), loss=st.floats(0.2, 3.0), push=st.floats(0.5, 1.0), speed=st.floats(0.5, 2.0))
 def test_dry_friction_is_coulombs_while_a_joint_moves(mass: float, loss: float, push: float, speed: float) -> None:
@@ -1374,7 +1362,15 @@ def test_dry_friction_is_coulombs_while_a_joint_moves(mass: float, loss: float, 
 
 @pytest.mark.parametrize("loss", [0.3, 1.0])
 def test_a_plan_with_dry_friction_is_replayed_by_mujocos_own_steps(loss: float) -> None:
-    robot = ls.MjcfRobot(scene_from_xml(DRY.replace("LOSS", repr(loss)).replace("MASS", "1"), "dry"))
+    turning = 'axis="0 1 0" damping="0.1" frictionloss="0.05" armature="0.05"'
+    xml = sled(
+        names=("way",), joint=f'frictionloss="{loss!r}"', geom=f'type="box" size="0.1 0.1 0.1" mass="1" {NO_CONTACT}',
+        carried=f"""<body><joint name="turn" {turning}/>
+          <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="0.2" {NO_CONTACT}/></body>""",
+        actuators="""<motor joint="way" gear="10" ctrlrange="-1 1"/><motor joint="turn" gear="2" ctrlrange="-1 1"/>""",
+        option='timestep="0.005" integrator="implicitfast"',
+    )  # fmt: skip
+    robot = ls.MjcfRobot(scene_from_xml(xml, "dry"))
     told = next(line for line in str(robot).splitlines() if "dry friction" in line)
     assert told == f"  dry friction, in plans and runs: way {loss:g} N, turn 0.05 N m"
     problem = robot.problem(robot.at(), robot.at(way=0.3, turn=0.4), steps=40, dt=0.02, weights={"m": 100, "rad": 100})

@@ -6,7 +6,7 @@ from pathlib import Path
 import mjcf_files
 import numpy as np
 import pytest
-from mechanisms import sled
+from mechanisms import motors, sled
 
 import lqrsim as ls
 from lqrsim.cli import main
@@ -48,9 +48,15 @@ def test_start_and_goal_are_at_rest_where_contacts_carry_the_robot(tmp_path: Pat
     """A box on a slide, above its floor: MuJoCo's contact is a spring, which its weight pushes in."""
     file = tmp_path / "box.xml"
     file.write_text(
-        """<mujoco><worldbody><geom type="plane" size="5 5 1"/><body pos="0 0 0.3"><joint name="z" type="slide"/>
-        <geom type="box" size="0.1 0.1 0.1" mass="2"/><body><joint name="arm" axis="0 0 1"/><geom size="0.05"/></body>
-        </body></worldbody><actuator><motor joint="arm"/></actuator></mujoco>""",
+        sled(
+            "z",
+            geom='type="box" size="0.1 0.1 0.1" mass="2"',
+            place="0 0 0.3",
+            option='timestep="0.002"',
+            carried='<body><joint name="arm" axis="0 0 1"/><geom size="0.05"/></body>',
+            actuators=motors(("arm",)),
+            things='<geom type="plane" size="5 5 1"/>',
+        ),
         encoding="utf-8",
     )
     problem = resolve(f"{file},goal={{'arm': 0.5}},at_rest=True").problem

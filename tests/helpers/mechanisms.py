@@ -73,13 +73,14 @@ def sled(
     joint: str = "",
     geom: str = 'type="sphere" size="0.1" mass="1"',
     place: str = "0 0 0",
+    carried: str = "",
     limits: Sequence[float] = (),
     actuators: str = "",
     option: str = 'timestep="0.01" gravity="0 0 0"',
     things: str = "",
     more: str = "",
 ) -> str:
-    """A body, with a geom of the same name, that slides along these axes.
+    """A body, with a geom of the same name, that slides along these axes and carries others.
 
     Joints have these names, by default those of the axes, and so have motors.
     """
@@ -88,7 +89,7 @@ def sled(
         f'<joint name="{own}" type="slide" axis="{" ".join("01"[axis == one] for one in "xyz")}" {joint}/>'
         for own, axis in zip(names, axes, strict=True)
     )
-    body = f'<body name="{name}" pos="{place}">{slides}<geom name="{name}" {geom}/></body>'
+    body = f'<body name="{name}" pos="{place}">{slides}<geom name="{name}" {geom}/>{carried}</body>'
     return scene(body, actuators or motors(names, limits), option=option, things=things, more=more)
 
 
