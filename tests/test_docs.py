@@ -21,10 +21,9 @@ BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 def run_page(name: str, **shorter: str) -> dict[str, Any]:
-    """Run the Python blocks of a page, in order, in one namespace; tracebacks have the page's line numbers.
+    """Run the Python blocks of a page, in order, in one namespace, with some arguments of calls changed, by name.
 
-    Args:
-      shorter: what stands in place of arguments of calls, such as "steps=50", by their names.
+    Tracebacks have the page's line numbers.
     """
     page = DOCS / name
     text = page.read_text(encoding="utf-8")
