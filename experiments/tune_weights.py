@@ -68,7 +68,7 @@ def problem_of(factors: Array) -> ls.Problem:
         stage_cost=ls.ControlCost(np.full(4, effort), about=own.nominal_control)
         + ls.ObstacleCost(scenario.scene.world, radius=scenario.robot.radius, sharpness=sharpness, weight=obstacles)
         + ls.QuadraticCost(speed * moves, about=np.zeros(len(moves))),
-        final_cost=own.final_cost.times(goal / OWN["goal"]),
+        final_cost=own.final_cost.scaled(goal / OWN["goal"]),
     )
 
 

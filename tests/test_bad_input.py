@@ -255,6 +255,9 @@ CALLS: list[tuple[Callable[[], object], str]] = [
       for function, numbers in ((rotations.quaternion, np.zeros(3)), (rotations.rotation_vector, np.ones(4)))],
     (lambda: ls.QuadraticCost({"x": 1.0}, about={}).weight.any(),
      "QuadraticCost: got numbers by name, want the cost from a Problem"),
+    *[(partial(cost.scaled, factor), rf"^factor: got {factor}, want a finite number >= 0")
+      for cost in (ls.ControlCost([1.0]), ls.ControlCost([1.0]) + ls.QuadraticCost([1.0], about=[0.0]))
+      for factor in (-1.0, np.nan)],
     (lambda: ls.FixedState(x=1.0).numbers.any(), "FixedState: got numbers by name, want the state from a Problem"),
     *[(partial(source_of, module, **constants), wanted) for module, constants, wanted in (
         ("no_such_module", {}, "want a file that was imported"), ("sys", {}, "want a file that was imported"),

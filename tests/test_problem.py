@@ -30,6 +30,28 @@ def test_a_sum_of_costs_keeps_its_terms_in_order() -> None:
             _ = other + a  # pyright: ignore[reportOperatorIssue]
 
 
+def test_a_sum_is_scaled_ahead_and_by_knot_as_its_terms() -> None:
+    rows = np.arange(3.0)[:, None]
+    a, b = ls.ControlCost({"u": 2.0}), ls.QuadraticCost([3.0, 1.0], about=rows * [1.0, 1.0])
+    stated = ls.Problem(
+        dynamics=_two(), dt=0.1, steps=2, initial=ls.FixedState(x=0.0), stage_cost=a + b,
+        final_cost=ls.QuadraticCost({"x": 1.0}, about={"y": 1.0}),
+    )  # fmt: skip
+    np.testing.assert_array_equal(stated.final_cost.weight, np.diag([1.0, 0.0]))  # pyright: ignore[reportAttributeAccessIssue]
+    summed = stated.stage_cost
+    effort, follows = summed.scaled(2).terms  # pyright: ignore[reportAttributeAccessIssue]
+    np.testing.assert_array_equal(effort.weight, [[4.0]])
+    np.testing.assert_array_equal(follows.weight, np.diag([6.0, 2.0]))
+    np.testing.assert_array_equal(follows.about, b.about)
+    np.testing.assert_array_equal(summed.ahead(1).terms[1].about, b.about[1:])  # pyright: ignore[reportAttributeAccessIssue]
+    assert (summed.by_knot, summed.moving) == (True, True)
+    twice = dataclasses.replace(stated, stage_cost=summed.scaled(2), final_cost=stated.final_cost.scaled(2))
+    assert ls.smooth(twice).cost == pytest.approx(2 * ls.smooth(stated).cost, rel=1e-9)
+    for what in ("kept_clear", "state_reference", "control_reference", "contact_curvature"):
+        with pytest.raises(ls.InputError, match=r"^cost: got a sum of costs, want a single term"):
+            getattr(summed, what)
+
+
 def _two(**fields: Any) -> ls.Dynamics:
     return ls.Dynamics(_double, states={"x": "", "y": ""}, controls={"u": ""}, **fields)
 

@@ -148,7 +148,8 @@ class ObstacleCost(KeepsClear, Cost):
         other.weight = check_number("ObstacleCost: weight", weight, at_least=0.0)
         return other
 
-    def times(self, factor: float) -> "ObstacleCost":
+    @checked
+    def scaled(self, factor: NonNegative) -> "ObstacleCost":
         return self.weighing(factor * self.weight)
 
     @property

@@ -10,9 +10,9 @@ a file of its own, with its kernel, and write `bind`.
 import abc
 import functools
 import operator
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Generic, NoReturn, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -294,9 +294,9 @@ class Cost(ProblemPart[CostTerm]):
         """Its second derivative in the distance to an obstacle at contact, in 1/m^2, which weighs paths; or 0."""
         return 0.0
 
-    def times(self, factor: float) -> "Cost":
+    def scaled(self, factor: float) -> "Cost":
         """The cost times a number. Costs with a reference or obstacles have it: the search changes their weights."""
-        raise InputError(f"{self.name}: got no method times, want it to return the cost times a number")
+        raise InputError(f"{self.name}: got no method scaled, want it to return the cost times a number")
 
     def moved_to(self, state: Array, dynamics: Dynamics) -> "Cost":
         """The cost about another state (n,). Costs with a state reference have it: a viewer moves goals."""
@@ -315,45 +315,63 @@ class Cost(ProblemPart[CostTerm]):
 
 
 class CostSum(Cost):
-    """The result of `+`: the terms, in order."""
+    """The result of `+`: the terms, in order. It is bound term by term, and what differs by term is asked of each."""
 
-    def __init__(self, terms: tuple[Cost, ...]) -> None:
-        self.terms = terms
+    def __init__(self, terms: Iterable[Cost]) -> None:
+        self.terms = tuple(terms)
+
+    def _refused(self) -> NoReturn:
+        raise InputError("cost: got a sum of costs, want a single term: bind the `terms` one by one")
+
+    kept_clear = state_reference = control_reference = contact_curvature = property(_refused)
+
+    def bind(self, dynamics: Dynamics) -> CostTerm:
+        self._refused()
+
+    @property
+    def by_knot(self) -> bool:
+        return any(term.by_knot for term in self.terms)
+
+    @property
+    def moving(self) -> bool:
+        return any(term.moving for term in self.terms)
+
+    def ahead(self, steps: int, *, horizon: str = "shrinking") -> "CostSum":
+        return CostSum(term.ahead(steps, horizon=horizon) for term in self.terms)
+
+    def with_added_state(self, dynamics: Dynamics) -> "CostSum":
+        return CostSum(term.with_added_state(dynamics) for term in self.terms)
+
+    def scaled(self, factor: float) -> "CostSum":
+        return CostSum(term.scaled(factor) for term in self.terms)
+
+    def _in(self, dynamics: Dynamics) -> "CostSum":
+        ordered = [term._in(dynamics) for term in self.terms]
+        return self if all(map(operator.is_, self.terms, ordered)) else CostSum(ordered)
 
     def __repr__(self) -> str:
         return " + ".join(map(repr, self.terms))
 
-    def ahead(self, steps: int, *, horizon: str = "shrinking") -> "CostSum":
-        return CostSum(tuple(term.ahead(steps, horizon=horizon) for term in self.terms))
 
-    def with_added_state(self, dynamics: Dynamics) -> "CostSum":
-        return CostSum(tuple(term.with_added_state(dynamics) for term in self.terms))
-
-    def bind(self, dynamics: Dynamics) -> CostTerm:
-        raise InputError("cost: got a sum of costs, want a single term: bind the `terms` one by one")
-
-
-def terms_of(cost: Cost, field: str = "cost") -> tuple[Cost, ...]:
+def terms_of(cost: Cost) -> tuple[Cost, ...]:
     """The terms of a sum; a single cost is its own."""
     if isinstance(cost, CostSum):
         return cost.terms
-    check_kind(field, cost, Cost, Cost._want)
-    return (cost,)
+    return (check_kind("cost", cost, Cost, Cost._want),)
 
 
-def in_system(cost: Cost, dynamics: Dynamics, field: str = "cost") -> Cost:
+def in_system(cost: Cost, dynamics: Dynamics, field: str) -> Cost:
     """The cost with numbers by name in the order of a system; the same object if it has no numbers by name."""
-    terms = terms_of(cost, field)
-    ordered = tuple(term._in(dynamics) for term in terms)
-    for term in ordered:
+    ordered = check_kind(field, cost, Cost, Cost._want)._in(dynamics)
+    for term in terms_of(ordered):
         if field in ("initial", "final_cost") and term.by_knot:
             raise InputError(f"{field}: got a {term.name} with a row for each knot, want one row, such as rows[-1]")
-    return cost if all(map(operator.is_, terms, ordered)) else CostSum(ordered)
+    return ordered
 
 
-def weighing_obstacles(cost: Cost, times: float) -> CostSum:
+def weighing_obstacles(cost: Cost, factor: float) -> CostSum:
     """The cost with the weights of its obstacles multiplied."""
-    return CostSum(tuple(term if term.kept_clear is None else term.times(times) for term in terms_of(cost)))
+    return CostSum(term if term.kept_clear is None else term.scaled(factor) for term in terms_of(cost))
 
 
 class Constraint(ProblemPart[ConstraintTerm]):

@@ -231,7 +231,7 @@ class Problem(OneVersion):
     @property
     def moving(self) -> bool:
         """Whether the problem depends on the time at which it begins, as with obstacles that move or a reference."""
-        return any(term.moving or term.by_knot for term in (*terms_of(self.stage_cost), *self.constraints))
+        return any(part.moving or part.by_knot for part in (self.stage_cost, *self.constraints))
 
     def _bound(self, costs: tuple[Cost, ...]) -> tuple[CostTerm, ...]:
         """The costs for the system. Raises InputError if `bind` does not return a term."""
@@ -276,7 +276,7 @@ class Problem(OneVersion):
         """The problem with other costs, None for the present ones. It may begin inside an obstacle if this one does."""
         given = {"stage_cost": stage_cost, "final_cost": final_cost}
         costs = {name: in_system(cost, self.dynamics, name) for name, cost in given.items() if cost is not None}
-        terms = {name: self._bound(terms_of(cost, name)) for name, cost in costs.items()}
+        terms = {name: self._bound(terms_of(cost)) for name, cost in costs.items()}
         return self._with(**costs, _terms=self._terms | terms)._checked_parts()
 
     def _refined(self, plan: Trajectory) -> "Problem | None":
@@ -304,7 +304,7 @@ class Problem(OneVersion):
         if not np.isfinite(begin):  # the sum of two finite numbers
             raise InputError(f"seconds: got {seconds:g} after begin, {self.begin:g}, want a finite sum")
         other = self._with(begin=begin, initial=_anywhere(self.initial))
-        if any(term.by_knot for term in (*terms_of(self.stage_cost), *self.constraints)):
+        if any(part.by_knot for part in (self.stage_cost, *self.constraints)):
             steps = round(seconds / self.dt)
             if steps < 0 or abs(seconds - steps * self.dt) > 1e-6 * self.dt:
                 want = f"a multiple of dt, {self.dt:g} s, not negative: a cost or a constraint has a row for each knot"
@@ -345,7 +345,7 @@ class Problem(OneVersion):
 
         return replace(
             self, segments=tuple(knots), constraints=[at_knots(constraint) for constraint in self.constraints],
-            stage_cost=CostSum(tuple(at_knots(cost_term) for cost_term in terms_of(self.stage_cost))),
+            stage_cost=CostSum(map(at_knots, terms_of(self.stage_cost))),
         )  # fmt: skip
 
     def _bound_anew(self) -> "Problem":

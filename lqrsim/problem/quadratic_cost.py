@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.annotations import NonNegative, checked
 from lqrsim.codegen.sources import source_of
 from lqrsim.errors import (
     Array,
@@ -85,7 +86,8 @@ class _SquareCost(Cost):
         weight, about = self._known
         return self._with(select(weight) if weight.ndim == 3 else weight, select(about) if about.ndim == 2 else about)
 
-    def times(self, factor: float) -> Self:
+    @checked
+    def scaled(self, factor: NonNegative) -> Self:
         return self._with(factor * self.weight, self.about)
 
     def _with(self, weight: Array, about: Array) -> Self:

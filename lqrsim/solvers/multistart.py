@@ -175,14 +175,14 @@ def passable(problem: Problem) -> list[bool]:
     ]
 
 
-def reweighted(problem: Problem, times: float) -> Problem:
+def reweighted(problem: Problem, factor: float) -> Problem:
     """The problem with larger weights of obstacles and goal: plans then go round and arrive at any price of controls.
 
     Only numbers change, so nothing is compiled. The constraints do not act in its solves.
     """
-    stage, final = (weighing_obstacles(cost, times) for cost in (problem.stage_cost, problem.final_cost))
-    heavier = (term if term.state_reference is None else term.times(times) for term in final.terms)
-    return problem.with_costs(stage_cost=stage, final_cost=CostSum(tuple(heavier)))
+    stage, final = (weighing_obstacles(cost, factor) for cost in (problem.stage_cost, problem.final_cost))
+    heavier = CostSum(term if term.state_reference is None else term.scaled(factor) for term in final.terms)
+    return problem.with_costs(stage_cost=stage, final_cost=heavier)
 
 
 def sinusoidal_controls(problem: Problem, cycles: int) -> Array:

@@ -23,7 +23,7 @@ class HuberDistance(ls.Cost):
     def state_reference(self) -> ls.QuadraticCost:  # a goal: the search has paths to it, and a viewer can move it
         return ls.QuadraticCost(dict.fromkeys(self.place, self.weight), about=self.place)
 
-    def times(self, factor: float) -> "HuberDistance":
+    def scaled(self, factor: float) -> "HuberDistance":
         return replace(self, weight=factor * self.weight)
 
     def moved_to(self, state: np.ndarray, dynamics: ls.Dynamics) -> "HuberDistance":

@@ -91,6 +91,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         rate, states={"x": "m", "v": "m/s"}, controls={"force": "N"}, parameters={"mass": 1.0}, level="plain"
     )
     world, box = place.scenario.scene.world, ls.Obstacle("box", "box", np.zeros(3), np.eye(3), np.ones(3))
+    around = ls.ObstacleCost(world, radius=0.2)
     term = ls.QuadraticCost([1.0, 1.0], about=[0.0, 0.0]).bind(cart)
     limits = ls.types.Coordinates(
         names=("x", "y", "angle"),
@@ -231,7 +232,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         },),
         "ObstacleCost": ({"world": world, "radius": 0.2, "sharpness": 10.0, "weight": 1.0},),
         "ObstacleCost of balls": ({"call": ls.ObstacleCost, "world": world, "balls": balls, "weight": 1.0},),
-        "ObstacleCost.weighing": ({"self": ls.ObstacleCost(world, radius=0.2), "weight": 2.0},),
+        "ObstacleCost.weighing": ({"self": around, "weight": 2.0},),
         "CollisionSpheres": ({
             "places": reach, "radii": [0.1], "names": ("hand",), "sites": ("tip",), "jacobian": reach_slopes,
             "depends_on": ("x",), "level": "plain",
@@ -252,10 +253,14 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
             for kind, one in {
                 "Cost": cost, "QuadraticCost": ls.QuadraticCost([1.0, 1.0], about=np.eye(5, 2)),
                 "ControlCost": ls.ControlCost([1.0], about=np.ones((4, 1))),
-                "ObstacleCost": ls.ObstacleCost(world, radius=0.2), "SymbolicCost": ls.SymbolicCost(bowl),
+                "ObstacleCost": around, "SymbolicCost": ls.SymbolicCost(bowl),
                 "FunctionCost": ls.FunctionCost(bowl), "SiteCost": ls.SiteCost("tip", position=(0.0, 0.0, 0.0)),
             }.items()
             for method, given in (("__add__", {"other": cost}), ("ahead", {"steps": 2, "horizon": "moving"}))
+        },
+        **{
+            f"{type(one).__name__}.scaled": ({"self": one, "factor": 2.0},)
+            for one in (ls.QuadraticCost([1.0, 1.0], about=[0.0, 1.0]), ls.ControlCost([1.0]), around)
         },
         "source_of": ({"module": "lqrsim.problem.quadratic_cost", "CONTROL": True},),
         "CostTerm": ({field.name: getattr(term, field.name) for field in dataclasses.fields(term)},),

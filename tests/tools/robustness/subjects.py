@@ -38,7 +38,7 @@ HOOKS |= {
     "effect",
 }
 HOOKS |= {f"{kind}.{name}" for kind in ("Simulator", "RotorPy", "Crazyflow") for name in ("step", "states", "place")}
-HOOKS |= {"with_added_state", "off_place", "times", "moved_to", "final_states", "state_bounds", "of_residual"}
+HOOKS |= {"with_added_state", "off_place", "Cost.scaled", "moved_to", "final_states", "state_bounds", "of_residual"}
 HOOKS |= {"Crazyflow.quadrotor"}  # takes crazyflow
 HOOKS |= {"TrialScore.failure"}  # a field, whose default is a function
 HOOKS |= {"settled"}  # an earlier name
