@@ -103,7 +103,7 @@ class Declared(NamedTuple):
     dtype: type[np.generic] | None  # of an array, float64 or int64; None if it is no array
     letters: str  # the shape of an array, or the length of something else; empty if not given
     bounds: Bounds | None
-    longest: int | None  # characters of a text that is one printable line; None for any text
+    longest: int | None  # characters of a text that is one printable line, None for any text; or items of a sequence
     want: str  # the end of messages; empty for the name of the type
     names: Collection[str]  # the texts that it may be; empty for any
     optional: bool
@@ -118,8 +118,8 @@ def checked(thing: T) -> T:
     """Decorator of a function or of a dataclass: check arguments by their annotations, and convert them.
 
     Numbers become Python's, for NumPy's are other types for the compiler, and JSON has no form for them; arrays become
-    float64 and sequences tuples. Defaults are not checked. Messages name an argument, and before it the class if it is
-    made, unless the class has another `_prefix`.
+    float64 and sequences tuples. Defaults are not checked. Messages begin with the argument's name; those of a
+    constructor with the class or its `_prefix` before that. An integer is at least 0 unless its bounds say otherwise.
     """
     if isinstance(thing, type):
         thing.__init__ = _checking(thing.__init__, lambda: _of_fields(thing))

@@ -79,7 +79,7 @@ def instruction_set() -> tuple[str, str, str]:
 def processor() -> str:
     """The processor that code is compiled for, and a hash of its features; see `instruction_set`.
 
-    If it differs, the same program gives other bits: instructions round differently, and sums have another order.
+    If it differs, the same program may give other bits: instructions round differently, and sums have another order.
     The hash includes the actual processor, on which NumPy and MuJoCo depend, and the target of LLVM.
     """
     import llvmlite.binding as llvm

@@ -11,9 +11,9 @@ Each is a SymPy function with derivatives `<name>_d1` and `<name>_d2` in s. Comp
 functions of the same names in `kernels/rotation_ratios.py`, with a power series near zero. Rotation vectors of length 2
 pi are singular.
 
-What turns about an axis on and on has other coordinates, without such places: three numbers whose entry along this axis
-is the angle of a turn about it, and whose other two are the rotation vector of a tilt, perpendicular to it, that comes
-first. They are a rotation vector where one of the two is zero, and singular where the tilt is half a turn.
+A body that turns about one axis on and on has other coordinates, which are not singular there. The entry along the axis
+is the angle of a turn about it; the other two are the rotation vector, perpendicular to the axis, of a tilt that comes
+before the turn. Without a turn or without a tilt they are the rotation vector; a tilt by half a turn is singular.
 """
 
 import sys
@@ -73,7 +73,9 @@ def quaternion(rotation_vector: npt.ArrayLike, *, turns_about: str | None = None
 
 
 def rotation_vector(quaternion: npt.ArrayLike, *, turns_about: str | None = None) -> Array:
-    """The rotation vectors (..., 3), at most half a turn in radians, of quaternions (..., 4), scalar first, any size.
+    """The rotation vectors (..., 3), at most half a turn in radians, of quaternions (..., 4), scalar first.
+
+    Quaternions may have any size but zero, whose vector is NaN.
 
     Args:
       turns_about: "x", "y" or "z", for a turn about this axis in the entry along it, after a tilt by the vector of the
@@ -108,7 +110,7 @@ def _index(turns_about: str) -> int:
 
 
 def _turned(quaternion: Array, along: int, half: Array) -> Array:
-    """Quaternions (..., 4), then turned about an axis, 0 to 2, by twice the angles (...)."""
+    """The quaternions (..., 4), followed by a turn about an axis, 0 to 2, by twice the angles `half` (...)."""
     turn = np.zeros(3)
     turn[along] = 1.0
     cosine, sine = np.cos(half)[..., None], np.sin(half)[..., None]
@@ -139,11 +141,11 @@ def _three(field: str, vector: Vector) -> tuple[Any, ...]:
     return tuple(expressions)
 
 
-def _numeric(one: object) -> bool:
-    """Whether it is a number of Python or NumPy, or an array of numbers."""
-    if isinstance(one, np.ndarray | np.generic):
-        return one.dtype.kind in "iuf"
-    return isinstance(one, float | int) and not isinstance(one, bool)
+def _numeric(value: object) -> bool:
+    """Whether a value is a number of Python or NumPy, or an array of numbers."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.dtype.kind in "iuf"
+    return isinstance(value, float | int) and not isinstance(value, bool)
 
 
 def _dot(a: Vector, b: Vector) -> Any:

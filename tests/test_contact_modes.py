@@ -77,6 +77,21 @@ def test_a_period_is_that_of_the_dynamics_and_its_first_switch_the_distance(
     assert first == pytest.approx(-depth, abs=1e-12)
 
 
+@settings(max_examples=examples(6))
+@given(st.lists(st.sampled_from([-1.01, 0.5, 1.01]), min_size=2, max_size=3))
+def test_switches_of_limits_have_the_same_names_with_sparse_jacobians(positions: list[float]) -> None:
+    slide = '<body pos="0 {0} 0"><joint name="{0}" type="slide" axis="1 0 0" range="-1 1"/><geom size="0.1"/></body>'
+    bodies = "".join(map(slide.format, range(len(positions))))
+    tendon = "".join(f'<joint joint="{k}" coef="1"/>' for k in range(len(positions)))
+    found: list[Switches] = []
+    for jacobian in ("dense", "sparse"):
+        text = f"""<mujoco><compiler autolimits="true"/><option gravity="0 0 0" jacobian="{jacobian}"/>
+          <worldbody>{bodies}</worldbody><tendon><fixed range="-0.4 0.4">{tendon}</fixed></tendon></mujoco>"""
+        modes = ContactModes(mujoco.MjModel.from_xml_string(text), 2)
+        found.append(modes.step(np.concatenate([positions, np.zeros(len(positions))]), np.zeros(0))[1])
+    np.testing.assert_array_equal(found[0].names, found[1].names)
+
+
 @pytest.mark.parametrize("kind", FILES)
 @settings(max_examples=examples(6))
 @given(mass=MASSES, speed=SPEEDS, part=st.floats(0.1, 0.9))

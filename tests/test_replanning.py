@@ -423,7 +423,7 @@ class TestReplanner:
             answer: Any = SimpleNamespace(
                 status=status, success=status.success, improved=better, cost=5.0, before=4.0, iterations=1, seconds=0.1
             )
-            assert log.enter(step, 0, answer) == (status.success or better)
+            assert log.record(step, 0, answer) == (status.success or better)
             used += better and not status.success
             not_used += not better and not status.success
         said = log.summary()
@@ -484,7 +484,7 @@ def test_an_answer_that_leads_to_infinity_is_counted_and_not_used(
     answer = replace(solver.solve(solution.trajectory.states[0], solution), cost=cost)
     for trial, late in enumerate((False, True)):
         used = np.isfinite(cost) and not late
-        assert log.enter(3, trial, answer, late=late) is bool(used)
+        assert log.record(3, trial, answer, late=late) is bool(used)
         record = log.records[-1]
         assert record.used is bool(used)
         assert ("diverges" in record.reason) == (not np.isfinite(cost))
@@ -516,7 +516,7 @@ class TestLive:
         state, late = solution.trajectory.states[3], 0.04
         with live(stated, solution, every=DT, clock=lambda: 0.0) as planner:
             control = planner.step(state, 3 * DT + late)
-            begun = planner._solve[0].state  # pyright: ignore[reportOptionalSubscript]
+            begun = planner._pending[0].state  # pyright: ignore[reportOptionalSubscript]
             h = DT - late
             there = np.concatenate([state[:2] + h * state[2:] + h**2 / 2 * control, state[2:] + h * control])
             np.testing.assert_allclose(begun, there, rtol=0, atol=1e-12)

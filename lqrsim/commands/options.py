@@ -28,8 +28,8 @@ RULES = ConstructorRegistry()
 
 
 @RULES.primitive_rule
-def _value_or_default(info: PrimitiveTypeInfo) -> Any:
-    """What is given for a `T | None` is a T. tyro would try None as well, and name types and markup if both fail."""
+def _optional_value(info: PrimitiveTypeInfo) -> Any:
+    """Read the text given for a `T | None` as a T: tyro would try None as well, and name both types if both fail."""
     kinds = set(get_args(info.type))
     if len(kinds) != 2 or NoneType not in kinds:
         return None
@@ -47,8 +47,8 @@ def _value_or_default(info: PrimitiveTypeInfo) -> Any:
 def options_of(file: str, name: str, /, **metavars: str) -> Callable[[type[Command]], type[Command]]:
     """Give a command options of a function or a record of the API, with its types, defaults and help.
 
-    They are read from its source: to import it would take a second, for `--help` too. The command declares those that
-    its own code uses, without help.
+    The source is parsed, for an import would take a second, for `--help` too. A command repeats the options that its
+    own code reads, without help, for the type checker.
 
     Args:
       file: path in the package. name: the function or class, or CLASS.METHOD.
@@ -128,14 +128,14 @@ Folder = Annotated[Path | None, optional("FOLDER")]
 Json = Annotated[FlagCreatePairsOff[bool], arg(help="Print one JSON object, all else to stderr; see docs/json.md.")]
 
 
-def stated(command: Any, function: Callable[..., Any], **others: Any) -> dict[str, Any]:
-    """The options of a command that a function or a record takes, by name; and others, in place of those."""
+def arguments_for(function: Callable[..., Any], command: Any, **overrides: Any) -> dict[str, Any]:
+    """The options of a command that a function or a record takes, by name; `overrides` take precedence."""
     names = inspect.signature(function).parameters
-    return {name: getattr(command, name) for name in names if hasattr(command, name)} | others
+    return {name: getattr(command, name) for name in names if hasattr(command, name)} | overrides
 
 
 def refuse(command: Any, names: Collection[str], why: str) -> None:
-    """Raise InputError if one of these options was given, which would be ignored; `why` ends the message."""
+    """Raise InputError if one of these options, which would be ignored, is not its default; `why` ends the message."""
     for field in fields(command):
         value = getattr(command, field.name)
         if field.name in names and value != field.default:

@@ -16,7 +16,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 import lqrsim as ls
 from lqrsim.commands import console
-from lqrsim.commands.options import ControllerName, DesignSet, Folder, Json, optional, options_of, refuse, stated
+from lqrsim.commands.options import ControllerName, DesignSet, Folder, Json, arguments_for, optional, options_of, refuse
 
 if TYPE_CHECKING:
     from lqrsim.solvers.settings import StartLike
@@ -300,8 +300,8 @@ class Simulate:
         controller = make_controller(self.controller, scenario, solution, design=self.design_disturbances)
         named = [disturbance for name in self.disturbances for disturbance in disturbance_set(name, scenario)]
         disturbances = [*(disturbance.scaled(self.strength) for disturbance in named), *self._single_disturbances()]
-        plant, goal = scenario.plant(), scenario.near_enough(**stated(self, scenario.near_enough))
-        options = stated(self, ls.simulate, controller=controller, disturbances=disturbances, **goal)
+        plant, goal = scenario.plant(), scenario.near_enough(**arguments_for(scenario.near_enough, self))
+        options = arguments_for(ls.simulate, self, controller=controller, disturbances=disturbances, **goal)
         with console.Progress("simulating", "step") as progress:
             rollout = ls.simulate(plant, solution, progress=progress, **options)
         console.say(rollout.summary())
@@ -392,7 +392,7 @@ class Bridge:
         if not self.safe:
             raise ls.InputError("--safe: got none, want the command for a robot that nobody controls, such as 0 0 0 0")
         policy: Any = ls.load(self.policy)
-        ran = bridge.run(policy, **stated(self, bridge.run, names=names))
+        ran = bridge.run(policy, **arguments_for(bridge.run, self, names=names))
         console.say(ran.summary())
         numbers = {"held": ran.held, "refused": ran.refused[0], "response": ran.response, "late": ran.late}
         console.result(periods=len(ran.commands), completed=ran.completed, reason=ran.reason, **numbers)
@@ -402,7 +402,7 @@ class Bridge:
         from lqrsim import bridge
 
         solution, scenario = console.load_with_scenario(self.policy, self.scenario)
-        with bridge.SimulatedRobot(solution, **stated(self, bridge.SimulatedRobot, names=names)) as robot:
+        with bridge.SimulatedRobot(solution, **arguments_for(bridge.SimulatedRobot, self, names=names)) as robot:
             rollout = ls.simulate(scenario.plant(), solution, controller=robot, **scenario.near_enough())
         console.say(rollout.summary())
         console.say(robot.summary())

@@ -11,7 +11,7 @@ from tyro.conf import Positional, Suppress, arg
 
 import lqrsim as ls
 from lqrsim.commands import console
-from lqrsim.commands.options import DesignSet, Folder, Json, SolutionFile, optional, options_of, refuse, stated
+from lqrsim.commands.options import DesignSet, Folder, Json, SolutionFile, arguments_for, optional, options_of, refuse
 
 PolicyName = Literal["smooth", "ilqr", "open_loop", "replan", "track", "offset_free"]
 CampaignPolicyName = Literal[PolicyName, "track_per_cell", "offset_free_per_cell"]
@@ -73,10 +73,10 @@ class Stress(SetupOptions):
             campaign = ls.stress.Results(folder, scenario=self.scenario).campaign
             campaign = campaign if self.solution is None else replace(campaign, solution=self.solution)
         else:
-            campaign = ls.stress.Campaign.of_sets(sets=self.sweep, **stated(self, ls.stress.Campaign))
+            campaign = ls.stress.Campaign.of_sets(sets=self.sweep, **arguments_for(ls.stress.Campaign, self))
             folder = folder_of(campaign.resolved)
         with console.Progress("stressing", "trial") as progress:
-            options = stated(self, ls.stress.run_campaign, progress=progress)
+            options = arguments_for(ls.stress.run_campaign, self, progress=progress)
             results = ls.stress.run_campaign(campaign, folder, **options)
         console.say(results.summary())
         console.wrote(folder)
@@ -165,7 +165,7 @@ class Report:
             results.rates().save(path)
         else:
             with console.Progress("reporting", "part") as progress:
-                ls.report(results, **stated(self, ls.report, out=path, progress=progress))
+                ls.report(results, **arguments_for(ls.report, self, out=path, progress=progress))
         console.wrote(path)
         if console.wants_result():
             console.result(campaign=console.of_campaign(results))
@@ -231,14 +231,14 @@ class FailureOptions(StudyOptions):
         from lqrsim.errors import check_count
         from lqrsim.scenarios.references import folder_name
 
-        problem = ls.stress.ReliabilityProblem(**stated(self, ls.stress.ReliabilityProblem))
+        problem = ls.stress.ReliabilityProblem(**arguments_for(ls.stress.ReliabilityProblem, self))
         folder = self.out or Path("runs") / type(self).__name__.lower() / folder_name(problem.resolved)
         check_count("shown", getattr(self, "shown", 1))
         console.check_output("--out", folder)
 
         def write(result: Any) -> int:
             console.say(self._words(result))
-            runs = result.save(folder, **stated(self, result.save))
+            runs = result.save(folder, **arguments_for(result.save, self))
             if runs is not None:
                 console.say(runs.summary())
             for name in self.FILES if runs is not None else self.FILES[:2]:
@@ -250,7 +250,7 @@ class FailureOptions(StudyOptions):
         try:
             with console.keeping(write), console.Progress(*self.SEARCH) as progress:
                 search = self._search(problem)
-                result = search(**stated(self, search, report=console.say, progress=progress))
+                result = search(**arguments_for(search, self, report=console.say, progress=progress))
         except ls.stress.NoFailure as none:
             return _say_none(none)
         return write(result)
@@ -370,7 +370,7 @@ class Certify:
         console.say(certificate.summary())
         try:
             with console.Progress("splitting", "repetition") as progress:
-                recheck = ls.stress.certify(certificate, **stated(self, ls.stress.certify, progress=progress))
+                recheck = ls.stress.certify(certificate, **arguments_for(ls.stress.certify, self, progress=progress))
         except ls.stress.NoFailure as none:
             return _say_none(none)
         console.say(recheck.summary())
@@ -416,12 +416,12 @@ class FunnelCommand(StudyOptions):
         from lqrsim.scenarios.references import disturbance_set, folder_name
         from lqrsim.stress.funnels import level_test
 
-        study = ls.stress.Study(**stated(self, ls.stress.Study))
+        study = ls.stress.Study(**arguments_for(ls.stress.Study, self))
         scenario = study.resolved
         folder = self.out or Path("runs/funnel") / folder_name(scenario)
         console.check_output("--out", folder)
         space, steps = scenario.problem.dynamics.state_coordinates, scenario.problem.steps
-        level_test(space, steps, **stated(self, level_test))  # checked before the solve
+        level_test(space, steps, **arguments_for(level_test, self))  # checked before the solve
         disturbances = []
         for name in self.disturbances:
             for disturbance in disturbance_set(name, scenario):
@@ -429,7 +429,7 @@ class FunnelCommand(StudyOptions):
                     console.say("without the InitialStateError of the set: runs begin in states of the funnel")
                     disturbance = disturbance.scaled(0.0)  # keeps the other disturbances' random numbers
                 disturbances.append(disturbance.scaled(self.strength))
-        options = stated(self, ls.funnel, **study.closed_loop, disturbances=disturbances)
+        options = arguments_for(ls.funnel, self, **study.closed_loop, disturbances=disturbances)
 
         def write(result: "ls.types.Funnel") -> int:
             console.say(result.summary())

@@ -11,7 +11,16 @@ from tyro.conf import Positional, arg
 
 import lqrsim as ls
 from lqrsim.commands import console
-from lqrsim.commands.options import ControllerName, DesignSet, Json, SolutionFile, optional, options_of, refuse, stated
+from lqrsim.commands.options import (
+    ControllerName,
+    DesignSet,
+    Json,
+    SolutionFile,
+    arguments_for,
+    optional,
+    options_of,
+    refuse,
+)
 from lqrsim.view.options import DRAWN_BY, OVERLAY_KINDS, OVERLAYS, Overlay, Quality
 
 if TYPE_CHECKING:
@@ -90,7 +99,7 @@ class Render:
             case _:
                 with console.Progress("rendering", "frame") as progress:
                     options = {**content, "trial": rows, "insets": self.inset, "titles": self.title}
-                    ls.render(drawn, out, **stated(self, ls.render, **options, progress=progress))
+                    ls.render(drawn, out, **arguments_for(ls.render, self, **options, progress=progress))
         console.wrote(out)
         return 0
 
@@ -351,7 +360,7 @@ class Export:
     def _to_c(self, folder: Path) -> None:
         console.check_output("--c", folder)
         policy: Any = ls.load(self.source)  # `export_c` refuses anything that cannot be exported
-        exported = ls.export_c(policy, folder, **stated(self, ls.export_c))
+        exported = ls.export_c(policy, folder, **arguments_for(ls.export_c, self))
         for path in exported.files:
             console.wrote(path)
         console.say(exported.summary())

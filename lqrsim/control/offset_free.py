@@ -605,7 +605,7 @@ class ReplannedRun(ControllerRun):
         start = InitialGuess(gain, in_c_order(offset), cost_to_go=plan.shifted(done, horizon="shrinking").cost_to_go)
         sent = self._sent[trial] if problem.control_rate is not None else None
         solution = self._rule.solve(SolveRequest(step, step, here, start, problem, sent))
-        if not self.log.enter(step, trial, solution):
+        if not self.log.record(step, trial, solution):
             return
         self.plans[trial][step] = solution.trajectory
         about = PlanModel(dynamics, solution.trajectory, model.uncertainty, model.sensor)

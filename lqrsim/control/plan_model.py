@@ -106,8 +106,8 @@ INEXACT = 0.02
 # The assumed difference between the command in force and the lost command, relative to the tolerated effort. This value
 # is our choice: up to a loss of one half, nothing between 0.3 and 1 does better.
 STALE = 0.3
-# Step of a parameter for differences, relative to its value if that is larger than 1; and the largest relative to a
-# small value, such as a moment of inertia of 1e-5 kg m^2, unless the step is then one of rounding.
+# The step of differences by a parameter p is STEP max(1, |p|), but at most OF_SMALL |p|, for a moment of inertia may be
+# 1e-5 kg m^2. This cap is at least LEAST_STEP, below which rounding dominates.
 STEP, OF_SMALL, LEAST_STEP = 1e-5, 1e-3, 1e-10
 
 
@@ -126,7 +126,7 @@ class Lag:
         return cls(float(np.exp(-step)), float(-np.expm1(-step) / step))
 
 
-class Step(NamedTuple):
+class LinearSteps(NamedTuple):
     """The linear model of all steps."""
 
     F: Array  # (T, Z, Z)
@@ -138,7 +138,7 @@ class PlanModel:
     """A plan and its uncertainty, linearised.
 
     Attributes:
-      n, m: numbers of states and of controls. lagging: number of entries of z for the actuators. size: that of all.
+      n, m: numbers of states and of controls. lagging: number of entries of z for the actuators. size: of z.
       lag: the lag, as a mean over commands that arrive and commands that get lost.
       parameters: the parameters of the dynamics that are unknown.
       remembered: the unknowns that have states. unknown_states: for each of these, the indices of its states.
@@ -264,17 +264,17 @@ class PlanModel:
         return self.effects @ self.output
 
     @cached_property
-    def step(self) -> Step:
+    def step(self) -> LinearSteps:
         """The model, as a mean over commands that arrive and commands that get lost."""
         return self._step(self.lag)
 
     @cached_property
-    def arriving(self) -> Step:
+    def arriving(self) -> LinearSteps:
         """The model for a command that arrives. A lost one is as if the command had been the actuators' states."""
         lost = self.uncertainty.command_loss
         return self._step(Lag.of(self.uncertainty.lag, self.plan.dt)) if lost else self.step
 
-    def _step(self, lag: Lag) -> Step:
+    def _step(self, lag: Lag) -> LinearSteps:
         n, a, steps = self.n, self.lagging, self.plan.steps
         F, G = np.zeros((steps, self.size, self.size)), np.zeros((steps, self.size, self.m))
         F[:, :n, :n] = self.jacobian[:, :, :n]
@@ -289,7 +289,7 @@ class PlanModel:
             behind = self.reached[:-1] - self.plan.controls
             c[:, :n] = np.einsum("tij,tj->ti", self.jacobian[:, :, n:], lag.mean * behind)
             c[:, n : n + a] = (lag.left - self.lag.left) * behind
-        return Step(F, G, c)
+        return LinearSteps(F, G, c)
 
     @cached_property
     def reached(self) -> Array:

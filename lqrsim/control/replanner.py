@@ -98,8 +98,8 @@ class ReplanLog:
         self.records: list[ReplanRecord] = []
         self.solved, self.kept = 0, Counter[str]()
 
-    def enter(self, step: int, trial: int, replan: Replan, *, late: bool = False) -> bool:
-        """Whether the new plan of a solve is used; `late` if it came after the deadline. Counts the solve."""
+    def record(self, step: int, trial: int, replan: Replan, *, late: bool = False) -> bool:
+        """Record a solve, `late` if it came after the deadline, and return whether its plan is used."""
         status, used = replan.status.name, False
         if not np.isfinite(replan.cost):
             reason = "the previous law diverges by the model"
@@ -112,11 +112,10 @@ class ReplanLog:
         self.solved += used
         if not used:
             self.kept[reason] += 1
-        record = ReplanRecord(
+        self.records.append(ReplanRecord(
             step=step, trial=trial, status=status, iterations=replan.iterations, seconds=replan.seconds,
             cost=replan.cost, before=replan.before, used=used, reason=reason,
-        )  # fmt: skip
-        self.records.append(record)
+        ))  # fmt: skip
         return used
 
     def summary(self, *, times: bool = False) -> str:
@@ -273,9 +272,10 @@ def within_rates(commands: Array, problem: Problem, sent: Array | None) -> Array
 class LiveReplanner:
     """One run of a `Replanner` on a robot, made by `Replanner.live`: its own loop calls `step` as often as it likes.
 
-    `step` only evaluates the law in force, and never waits for a solve. A solve begins with the first call in a control
-    period in which one is due. Its answer comes into force at the deadline; one that is not ready then is not used.
-    Everything is compiled before the first step.
+    `step` evaluates the law in force, and never waits for a solve. A solve begins with the first call in a control
+    period in which one is due; that call also asks for `changes` and predicts the state at the deadline. The answer
+    comes into force at the deadline; one that is not ready then is not used. Everything is compiled before the first
+    step.
 
     Attributes:
       problem: the problem that is solved from now on.
@@ -294,8 +294,8 @@ class LiveReplanner:
         self.problem, self.active, self.log = rule.problem, ActivePlan(rule.solution, 0), ReplanLog()
         self._asked = -1  # the step at which a solve was last due
         self._step, self._command, self._sent = -1, None, None  # of the last call, and the command of a period before
-        self._solve: tuple[SolveRequest, Future[Replan]] | None = None
-        self._missed = False  # whether it was not done at its deadline
+        self._pending: tuple[SolveRequest, Future[Replan]] | None = None
+        self._missed = False  # whether the pending solve was not done at its deadline
         self._thread: ThreadPoolExecutor | None = None
         self._begun = False
 
@@ -318,8 +318,8 @@ class LiveReplanner:
     def change(self, **parts: Any) -> None:
         """Change fields of the problem from the next solve on: `live.change(final_cost=...)`.
 
-        Goals, weights, obstacles, parameters and limits can change. To change an estimate of a disturbance, plan with
-        `dynamics.disturbed` from the beginning. dt, steps, states and controls cannot.
+        Goals, weights, obstacles, parameters and limits can change; dt, steps, states and controls cannot. To change an
+        estimate of a disturbance, plan with `dynamics.disturbed` from the beginning.
         """
         try:
             changed = replace(self.problem, **parts)
@@ -337,7 +337,7 @@ class LiveReplanner:
         dt = self.problem.dt
         step = int(min(t / dt, LONGEST) + 1e-9)
         self._adopt_answer(step)
-        if self._solve is None and self._rule.due(step, self._asked):
+        if self._pending is None and self._rule.due(step, self._asked):
             self._ask(self._thread, state, t, step)
         policy = self.active.plan.policy
         command = policy(state, max(t - self.active.first * dt, 0.0), interpolate=self._interpolate)
@@ -356,20 +356,20 @@ class LiveReplanner:
         request = self._rule.request(self.active, step, state, problem, late=late, sent=self._command)
         deadline = begun + self._rule.delay * dt - late
         answer = thread.submit(lambda: self._rule.solve(request, max(deadline - self._clock() - SPARE, 1e-6)))
-        self._solve, self._missed = (request, answer), False
+        self._pending, self._missed = (request, answer), False
 
     def _adopt_answer(self, step: int) -> None:
         """Put an answer into force at its deadline. A late answer is not used."""
-        if self._solve is None or step < self._solve[0].first:
+        if self._pending is None or step < self._pending[0].first:
             return
-        request, answer = self._solve
+        request, answer = self._pending
         if not answer.done():
             self._missed = True  # its thread continues until the solve is done, and the next solve waits for it
             return
-        self._solve = None
+        self._pending = None
         if error := answer.exception():
             self.log.kept[str(error)] += 1
-        elif self.log.enter(request.step, 0, answer.result(), late=self._missed):
+        elif self.log.record(request.step, 0, answer.result(), late=self._missed):
             self.active = ActivePlan(answer.result(), request.first)
 
 
@@ -392,7 +392,8 @@ class Replanner(Controller):
     runs can share a re-planner.
 
     In a simulation a solve takes as long as `computing` says: a number, a function of a `numpy.random.Generator`, with
-    which results are bit-identical on all machines, or "measured". The rollout's `controller_run` has a `log` of the
+    which results do not depend on how long solves take, or "measured". Its first solve is after `every`; a live run
+    solves at its first step, too. The rollout's `controller_run` has a `log` of the
     solves, like a `LiveReplanner`, and the plans in force, `active`.
 
     Args:
@@ -518,7 +519,7 @@ class ReplannerRun(ControllerRun):
         sent = [None] * len(measured) if self._sent is None else self._sent
         requests = [rule.request(self.active[k], step, measured[k], problem, sent=sent[k]) for k in trials]
         for trial, request, replan in zip(trials, requests, self._solve(requests), strict=True):
-            if self.log.enter(step, trial, replan, late=self._late(measured[trial], step, replan)):
+            if self.log.record(step, trial, replan, late=self._late(measured[trial], step, replan)):
                 self._next[trial] = ActivePlan(replan, request.first)
 
     def _solve(self, requests: list[SolveRequest]) -> list[Replan]:

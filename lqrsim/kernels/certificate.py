@@ -24,7 +24,7 @@ from lqrsim.kernels.riccati import minimize_control
 
 # A predicted decrease below this, relative to the terms that cancel in it, consists of squares of rounding errors: all
 # that an optimal cost of zero leaves.
-SQUARES = 1e-28
+NEGLIGIBLE_DECREASE = 1e-28
 # A control block that is definite by less than this part of its own largest curvature gets as much more. If its own is
 # less than this part of the largest along the plan, this part of the typical cost takes the place of a curvature.
 OF_BLOCK, OF_PLAN, WEIGHT = 1e-12, 1e-9, 1e-2
@@ -104,7 +104,7 @@ def certify(settings, of_policy, plan, policy, to_go, model, row):
         predicted, slopes, largest = predicted_decrease(
             step, stage, policy.gain[t], hessians[t + 1], change_limits, sizes, largest, costate
         )
-        decrease += 0.0 if predicted <= SQUARES * terms else predicted
+        decrease += 0.0 if predicted <= NEGLIGIBLE_DECREASE * terms else predicted
         uncurved += slopes
         if of_policy:
             gain, S = policy.gain[t], hessians[t + 1]
@@ -115,7 +115,7 @@ def certify(settings, of_policy, plan, policy, to_go, model, row):
         terms = scale_of(states[0], none, stage)
         scale += terms
         terms += curved_terms(states[0], hessians[0])
-        decrease += start_decrease(stage, hessians[0], SQUARES * terms, costate)
+        decrease += start_decrease(stage, hessians[0], NEGLIGIBLE_DECREASE * terms, costate)
     worst = 0.0
     for i in range(N):
         worst = larger(worst, residual[i] / size[i])

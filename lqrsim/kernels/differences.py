@@ -56,7 +56,7 @@ def places_jacobian(x, data, out, slopes):
 
 
 def noise_slopes(x, u, data, out, slopes):
-    """Write the noise matrix M (N, COLUMNS), and its derivatives (COLUMNS, N, any), one for each of ACTIVE."""
+    """Write the noise matrix (N, COLUMNS), and the derivatives of its entries (i, k) by those of ACTIVE (k, i, any)."""
     y, v, above, below = stack(N), stack(M), stack(N, COLUMNS), stack(N, COLUMNS)
     copy(x, N, y)
     copy(u, M, v)

@@ -46,7 +46,7 @@ from lqrsim.kernels.riccati import (
 )
 
 # A predicted decrease below this fraction of the terms that cancel in it is a rounding error.
-SQUARES = 1e-28
+NEGLIGIBLE_DECREASE = 1e-28
 
 
 def forward_pass(settings, model, about, work):
@@ -56,8 +56,8 @@ def forward_pass(settings, model, about, work):
 
     Args:
       settings: IterationSettings. model: ProblemModel. about: Linearization.
-      work: SmootherArrays. `x_hat` is the state at which c_0 is quadratised, and on return the smoothed state at T, at
-        which c_l was quadratised.
+      work: SmootherArrays. `x_hat` is the state at which c_0 is quadratised; on return the smoothed state at T, after
+        c_l was quadratised at the one before.
     """
     stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
     arrived, costate, u, forward_jacobian = stack(N), stack(N), stack(M), stack(N, W)
@@ -96,11 +96,11 @@ def backward_pass(settings, model, about, work):
     Linearises at a fraction `about.reach` of the way from the plan to the smoothed states; in the paper, at these.
 
     Args:
-      work: SmootherArrays. On return `x_hat` is the smoothed state at 0, where c_0 was quadratised anew, and `x_hats`
-        has all smoothed states. The rest is as for `forward_pass`.
+      work: SmootherArrays. On return `x_hat` is the smoothed state at 0, after c_0 was quadratised at the one before,
+        and `x_hats` has all smoothed states. The rest is as for `forward_pass`.
 
-    It also returns the negligible cost: if the optimal cost is zero, squares of rounding errors of the constants of the
-    stages' models remain, which cancel.
+    Also returns the cost that counts as zero: at an optimal cost of zero the constants of the stages' models cancel, up
+    to rounding errors of about this size.
     """
     stage, step = QuadraticStage(stack(W, W), stack(W)), LinearStep(stack(N, W), stack(N))
     arrived, x, u, costate = stack(N), stack(N), stack(M), stack(N)
@@ -329,7 +329,7 @@ def ddp_pass(steps, plan, model, order, keep, policy, to_go):
         decrease, good = minimize_within(stage, no_change, change_limits, gain, offset, curve, slope)
         if not good:
             return t, finite(hessian, W, W) and finite(jacobian, N, W), predicted
-        if not decrease <= SQUARES * terms:  # a NaN stays
+        if not decrease <= NEGLIGIBLE_DECREASE * terms:  # a NaN stays
             predicted += decrease
         constant = cost_ahead - predicted
         for i in range(N):
@@ -369,7 +369,8 @@ def initial_step(x0, model, second_order, to_go, direction):
     decrease = 0.0
     for i in range(N):
         decrease -= 0.5 * slope[i] * direction[i]
-    return 0.0 if decrease <= SQUARES * (diagonal_terms(x0, N, 0, hessian) + diagonal_terms(x0, N, 0, S)) else decrease
+    terms = diagonal_terms(x0, N, 0, hessian) + diagonal_terms(x0, N, 0, S)
+    return 0.0 if decrease <= NEGLIGIBLE_DECREASE * terms else decrease
 
 
 def diagonal_terms(z, size, first, hessian):

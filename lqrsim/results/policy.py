@@ -65,7 +65,7 @@ class AffinePolicy:
         return replace(self, **parts)
 
     def control(self, state: npt.ArrayLike, step: int) -> Array:
-        """Controls (..., m) of one step before saturation, at states (..., n) in the nominal's representative."""
+        """Controls (..., m) of one step before saturation, at states (..., n), angles nearest to the nominal ones."""
         step = check_count("step", step, at_least=0, at_most=self.steps - 1)
         return vectors_of("state", state, self.gain.shape[-1]) @ self.gain[step].T + self.offset[step]
 

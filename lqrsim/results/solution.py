@@ -37,7 +37,7 @@ class Plan:
     A `Solution` and a `Replan` are plans with a `cost` and a `violation`.
 
     Attributes:
-      detail: where and why it failed; for solutions also remarks.
+      detail: where and why the solve failed; for solutions also remarks.
       trajectory: the plan: the rollout of the policy by the model from its first state.
       cost_to_go: the value function of the law, a `Quadratic`; None if it is unknown, and for re-plans with
         constraints, which do not need it.
@@ -260,7 +260,10 @@ class Solution(Plan):
         }  # fmt: skip
 
     def open_loop(self) -> "Solution":
-        """The same plan with zero gains, for comparison: the planned controls, independent of the state."""
+        """The same plan with zero gains, for comparison: the planned controls, independent of the state.
+
+        The value functions are still those of the feedback policy.
+        """
         policy = replace(self.policy, gain=np.zeros_like(self.policy.gain), offset=self.trajectory.controls)
         return replace(self, policy=policy, inverse_policy=None)
 
@@ -307,7 +310,7 @@ class Solution(Plan):
         if not np.isfinite(self.trajectory.states).all():
             return []
         lines = self.target.of_plan(self.target.radius_of_plan(self.goal_radius))
-        return lines if self.success and not self.remedy else lines[:1]  # which says what to do
+        return lines if self.success and not self.remedy else lines[:1]  # a remedy says what to do
 
     def _beyond_limits(self) -> list[str]:
         """A line for each control with a plan beyond its limits."""

@@ -75,7 +75,7 @@ class Switches:
         return (self.names & _FORCE) != 0
 
     def before_jump(self, crossed: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-        """Which of them are seen before the first distance of those crossed has an effect, or with it."""
+        """Flags of those that are evaluated no later than the first crossed distance can act; all without one."""
         jumps = self.names[crossed & ~self.forces]
         return self.names < (jumps[0] // _FORCE + 1) * _FORCE if len(jumps) else np.ones(len(self.names), np.bool_)
 
@@ -103,8 +103,9 @@ class ContactModes:
     check_time: Callable[[], None] = staticmethod(lambda: None)
 
     def __init__(self, model: mujoco.MjModel, substeps: int) -> None:
-        self._model, self._substeps = model, substeps
-        self._data, self._wide_model = mujoco.MjData(model), copy.copy(model)
+        self._model, self._substeps = copy.copy(model), substeps
+        self._model.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)  # limits are told by their rows
+        self._data, self._wide_model = mujoco.MjData(self._model), copy.copy(self._model)
         for margins in (self._wide_model.jnt_margin, self._wide_model.tendon_margin, self._wide_model.geom_margin):
             margins[:] += _WATCHED
         self._wide_data, self._nv = mujoco.MjData(self._wide_model), model.nv
@@ -112,11 +113,11 @@ class ContactModes:
 
     @staticmethod
     def known_for(model: mujoco.MjModel) -> bool:
-        """Whether all switches are known: joints only slide or turn, and friction cones are pyramids."""
-        turning = np.isin(model.jnt_type, [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)])
+        """Whether all switches are known: of joints that slide or turn, and of friction cones that are pyramids."""
+        scalar_joints = np.isin(model.jnt_type, [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)])
         dry = model.dof_frictionloss.any() or model.tendon_frictionloss.any()
         elliptic = model.opt.cone == int(mujoco.mjtCone.mjCONE_ELLIPTIC)
-        return bool(turning.all()) and not (dry or elliptic or model.na or model.npair or model.geom_gap.any())
+        return bool(scalar_joints.all()) and not (dry or elliptic or model.na or model.npair or model.geom_gap.any())
 
     def step(self, state: Array, control: Array) -> tuple[Array, Switches]:
         """The state (n,) after a control period, and its switches."""
@@ -186,7 +187,8 @@ class ContactModes:
     def linearize(self, state: Array, control: Array) -> Period:
         """The control period and its derivatives, by differences that stay in its contact mode.
 
-        Differences are central if both sides stay in the mode, one-sided if one side does, and smaller if neither does.
+        Differences are central if both sides stay in the mode, one-sided if one side does, and smaller if neither does;
+        if none stays in it, they are the smallest, across its end.
         """
         n, point = len(state), np.concatenate([state, control])
         end, switches = self.step(state, control)
@@ -294,7 +296,7 @@ class Approaches:
         self._place(self._positions[0])
         point = self._tip(tool, way[0])
         offset = self._spot(tool, point) - centre
-        touching = self._reach(tool, point, centre, -forward)
+        touching = self._reach(tool, point, -forward)
         radii = np.linspace(max(float(np.linalg.norm(offset)), touching), touching, begin + 1)
         radii[1:-1] = np.maximum(radii[1:-1], _ROUND * touching)
         for words, directions in _paths(_unit(offset), -forward):
@@ -308,14 +310,14 @@ class Approaches:
                 yield f"a push by {self._model.geom(tool).name}{words}", positions
 
     def _grasp(self, pair: tuple[int, int], pressed: float, way: Array, begin: int, end: int) -> tuple[str, Array]:
-        """A grasp by two tools, from straight where they are, on both sides of the body's way."""
+        """A grasp by two tools, which come straight from where they are to both sides of the body's way, and close."""
         self._place(self._positions[0])
         points = [self._tip(tool, way[0]) for tool in pair]
         spots = np.array([self._spot(*tip) for tip in zip(pair, points, strict=True)])
         forward, line, sides = _unit(way[end] - way[begin]), spots[0] - spots[1], np.array([[1.0], [-1.0]])
         line = _unit(line - (line @ forward) * forward)
         tips = zip(pair, points, sides, strict=True)
-        touching = [self._reach(tool, point, way[begin], side * line) for tool, point, side in tips]
+        touching = [self._reach(tool, point, side * line) for tool, point, side in tips]
         begin_closing = max(begin - round(_CLOSING * self._steps), 1)
         centres = way.copy()
         centres[:begin_closing] = np.linspace(spots.mean(axis=0), way[begin], begin_closing)
@@ -357,8 +359,8 @@ class Approaches:
     def _spot(self, tool: int, point: Array) -> Array:
         return self._data.geom_xpos[tool] + self._axes(tool) @ point
 
-    def _reach(self, tool: int, point: Array, centre: Array, side: Array) -> float:
-        """How far to a side of the body's centre a tool's point is when the tool touches the body.
+    def _reach(self, tool: int, point: Array, side: Array) -> float:
+        """How far to a side of the body's centre a tool's point is when the tool touches the body, where it is now.
 
         The tool comes from afar, by its distance from the body at each step, as it then cannot pass through.
         """

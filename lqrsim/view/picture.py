@@ -47,7 +47,7 @@ GLOW = 0.3  # emission of what hangs in space; what lies on a floor is lit as th
 INSETS_FRACTION = 0.4  # fraction of a run's part for its insets
 INK, PAPER = (28, 32, 38, 255), (255, 255, 255, 200)
 HEADER_FRACTION = 0.4  # largest fraction of a picture's height for the header
-LETTER_HEIGHTS = 44, 54  # numbers of lines of text in the height of a picture, and in the width of a narrow one
+LETTERS_PER_HEIGHT, LETTERS_PER_WIDTH = 44, 54  # a picture's size in letter heights; the smaller letter is used
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def split_into_panes(box: Box, insets: int) -> list[Box]:
 @checked
 @dataclass(frozen=True)
 class Pane(Box):
-    """A part of the picture that shows a row of one of the metadata's rollouts, with a camera if it is calibrated."""
+    """A part of the picture that shows a trial of a run, by their indices, with the camera if it is calibrated."""
 
     run: int = 0
     trial: int = 0
@@ -104,7 +104,7 @@ class Caption:
         self.overlays, self.speed, self.width = overlays, speed, box.width
         self.letter_height = _letter_height(box.width, box.height)
         title = title or recorded.name + (f", trial {run.first_trial + recorded.trial}" if run.trials > 1 else "")
-        self.header = self._header_tile(title, list(run.disturbances) or ["undisturbed"], box)
+        self.header = self._header_tile(title, list(run.disturbances), box)
         # Readings keep their place: next to the title in a strip that is wide enough, otherwise in separate lines.
         longest = self._readings_width(1)
         bare_title = text_tile((title,), self.letter_height, width=0)
@@ -114,12 +114,13 @@ class Caption:
         self.place = (self.width - longest, 0) if beside else (0, self.header.shape[0])
         self.height = self.header.shape[0] + (0 if beside else self._readings_tile(recorded.end).shape[0])
 
-    def _header_tile(self, title: str, what: list[str], box: Box) -> Pixels:
+    def _header_tile(self, title: str, disturbances: list[str], box: Box) -> Pixels:
         """The title, as many disturbances as leave most of the picture free, and the number of the remaining ones."""
         tile = np.empty((0, 0, 4), dtype=np.uint8)
-        for count in range(len(what), -1, -1):
-            left = len(what) - count
-            words = what[:count] + ([f"{left} more disturbances" if count else f"{left} disturbances"] if left else [])
+        for count in range(len(disturbances), -1, -1):
+            left = len(disturbances) - count
+            rest = [f"{left}{' more' if count else ''} disturbance{'s' if left > 1 else ''}"] if left else []
+            words = [*disturbances[:count], *rest] or ["undisturbed"]
             lines = [title, *wrap("; ".join(words), self.letter_height, self.width - round(1.4 * self.letter_height))]
             tile = text_tile(tuple(lines), self.letter_height, width=self.width)
             if tile.shape[0] <= HEADER_FRACTION * box.height:
@@ -187,7 +188,7 @@ class Legend:
 
 
 def _letter_height(width: int, height: int) -> int:
-    return max(round(min(height / LETTER_HEIGHTS[0], width / LETTER_HEIGHTS[1])), 9)
+    return max(round(min(height / LETTERS_PER_HEIGHT, width / LETTERS_PER_WIDTH)), 9)
 
 
 @lru_cache(maxsize=16)
@@ -386,7 +387,7 @@ def open_picture(
     """Open a picture of runs, to be used with `with`, because it holds OpenGL contexts; arguments as in `render`."""
     check_drawn(overlays, solution=solution, funnel=funnel, titles=titles)
     settings = QUALITIES[quality]
-    width, height = settings.size if size is None else even(size)
+    width, height = settings.size if size is None else check_even(size)
     if len(insets) > MOST_INSETS:
         raise InputError(f"insets: got {len(insets)}, want {MOST_INSETS} at most")
     distinct, shown = _runs_and_trials(runs, trial)
@@ -477,7 +478,7 @@ class LivePicture:
     def __init__(self, camera: CameraName, size: Size) -> None:
         if camera == "chase":
             raise InputError("camera: got 'chase', want one that does not look ahead, such as 'overview' or 'top'")
-        self._open = partial(open_picture, camera=camera, overlays=("plan",), quality="draft", size=even(size))
+        self._open = partial(open_picture, camera=camera, overlays=("plan",), quality="draft", size=check_even(size))
         self._stack = contextlib.ExitStack()
         self._picture: Picture | None = None
 
@@ -494,8 +495,8 @@ class LivePicture:
         self._stack.close()
 
 
-def even(size: tuple[int, int]) -> tuple[int, int]:
-    """The width and height, which h264 needs even."""
+def check_even(size: tuple[int, int]) -> tuple[int, int]:
+    """The width and height. Raises InputError if one is odd, which h264 cannot encode."""
     if size[0] % 2 or size[1] % 2:
         raise InputError(f"size: got {size[0]} x {size[1]}, want even numbers, which h264 needs")
     return size

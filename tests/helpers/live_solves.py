@@ -5,5 +5,5 @@ import lqrsim as ls
 
 def ready(planner: ls.types.LiveReplanner) -> None:
     """Wait for the answer that the planner's thread is at."""
-    if planner._solve is not None:
-        planner._solve[1].exception()
+    if planner._pending is not None:
+        planner._pending[1].exception()
