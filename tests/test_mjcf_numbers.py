@@ -180,10 +180,10 @@ def test_changes_add_up_and_the_first_keeps_its_own() -> None:
     np.testing.assert_allclose(stepped(heavy), stepped(robot_of(cart=3.0, friction=0.2).dynamics), atol=1e-12)
     np.testing.assert_array_equal(stepped(dynamics), before)
     assert dynamics.numbers == data
-    assert len({dynamics.fixed, heavy.fixed, dynamics.with_parameters(cart_mass=3.0).fixed}) == 3
+    assert len({dynamics.model_digest, heavy.model_digest, dynamics.with_parameters(cart_mass=3.0).model_digest}) == 3
     again = pickle.loads(pickle.dumps(heavy))
     np.testing.assert_array_equal(stepped(again), stepped(heavy))
-    assert (again.numbers, again.fixed) == (heavy.numbers, heavy.fixed)
+    assert (again.numbers, again.model_digest) == (heavy.numbers, heavy.model_digest)
 
 
 def test_what_is_pushed_has_them_too() -> None:

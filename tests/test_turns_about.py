@@ -174,7 +174,7 @@ def test_copies_and_other_obstacles_keep_the_axis() -> None:
     assert robot.dynamics.state_coordinates.angles == (4,)
     plain = ls.MjcfRobot(robot.scene)
     assert plain.dynamics.state_coordinates.angles == ()
-    assert plain.dynamics.fixed != robot.dynamics.fixed  # distances of the same state are others
+    assert plain.dynamics.model_digest != robot.dynamics.model_digest  # distances of the same state are others
     wall = ls.World([ls.Obstacle("wall", "sphere", np.array([1.0, 0, 0]), np.eye(3), np.array([0.2, 0, 0]))])
     moved: Array = np.array([state, robot.at(rx=0.3, ry=9.0 - 4 * np.pi, rz=-0.4)])
     shape = robot.among(wall)

@@ -790,7 +790,7 @@ class OffsetFree(Controller):
         numbers = np.array(
             [model.plan.dt, model.uncertainty.lag, uncertainty.latency, uncertainty.delay, uncertainty.command_loss]
         )
-        moved = model.dynamics.fixed or np.array(list(model.dynamics.parameters.values()), dtype=np.float64)
+        moved = model.dynamics.model_digest or np.array(list(model.dynamics.parameters.values()), dtype=np.float64)
         sources = model.dynamics.step_source.digest, moved, model.sensor.source.digest, model.sensor.data
         further: list[str | Array] = []
         if self._rule is not None:

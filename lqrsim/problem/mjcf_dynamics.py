@@ -13,6 +13,7 @@ import math
 import platform
 import threading
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -64,10 +65,11 @@ _forming = threading.Lock()  # held while a team of threads is formed
 _making = threading.Lock()  # held while MuJoCo's memory is made, which one thread does for all
 
 
+@dataclass(eq=False)
 class MjcfPhysics:
-    """The data of an MJCF for `kernels/mjcf_dynamics.py`.
+    """The model that plans step with, and MuJoCo's memory for the threads of `kernels/mjcf_dynamics.py`.
 
-    The model is the MJCF's own, except that
+    `physics.model` is a changed copy of the MJCF's own, `mjcf.model`:
 
     - obstacles do not collide: costs and constraints keep clear of them;
     - controls are not clipped to their range, which would hide from a solver the direction back into the range, nor are
@@ -77,51 +79,92 @@ class MjcfPhysics:
 
     Args:
       body: id of the body that is pushed. obstacles: ids of the geoms that are obstacles.
-      loaded: whether bodies carry loads, point masses at their centres of mass, which are then among the numbers.
+      unlimited: ids of the actuators and of the joints whose forces are not limited here.
       softness: depth in m or rad over which the impedance of contacts and limits rises from zero; 0 for the MJCF's
         impedance.
-      unlimited: ids of the actuators and of the joints whose forces are not limited here.
-
-    `numbers` are those for the kernel, without a wrench and loads; `team` has the words that its threads share.
+      loaded: whether bodies carry loads, point masses at their centres of mass, which are then among the numbers.
     """
 
-    def __init__(
-        self,
-        mjcf: MjcfModel,
-        *,
-        body: int,
-        obstacles: tuple[int, ...],
-        loaded: bool = False,
-        softness: float = 0.0,
-        unlimited: tuple[tuple[int, ...], tuple[int, ...]] = ((), ()),
-    ) -> None:
-        self.model = copy.copy(mjcf.model)
-        self.model.geom_contype[list(obstacles)] = self.model.geom_conaffinity[list(obstacles)] = 0
-        option, flags = self.model.opt, mujoco.mjtDisableBit
+    mjcf: MjcfModel
+    body: int
+    obstacles: tuple[int, ...]
+    unlimited: tuple[tuple[int, ...], tuple[int, ...]] = ((), ())
+    softness: float = 0.0
+    loaded: bool = False
+
+    def __post_init__(self) -> None:
+        self.model = model = copy.copy(self.mjcf.model)
+        for geom in np.intersect1d(self.obstacles, [model.pair_geom1, model.pair_geom2])[:1]:
+            who = model.geom(int(geom)).name
+            raise InputError(f"geom {who!r}: got an obstacle in a <contact><pair>, want contype/conaffinity instead")
+        model.geom_contype[list(self.obstacles)] = model.geom_conaffinity[list(self.obstacles)] = 0
+        option, flags = model.opt, mujoco.mjtDisableBit
         option.disableflags |= int(flags.mjDSBL_CLAMPCTRL) | int(flags.mjDSBL_AUTORESET) | int(flags.mjDSBL_SENSOR)
         option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         option.tolerance = min(option.tolerance, _CONVERGED)
         if mujoco.__version__ == "4.0.0":
             option.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)  # on sparse Jacobians its Newton solver is wrong
-        self.model.actuator_forcelimited[list(unlimited[0])] = 0
-        self.model.jnt_actfrclimited[list(unlimited[1])] = 0
-        if softness > 0:
-            _soften(self.model, softness)
-        # With loads, each slot has its own model, which may be large; filters need one slot.
-        slots = 2 if loaded else 2 * processors()
-        self._models = [copy.copy(self.model) if loaded else self.model for _ in range(slots)]
-        self._data = [mujoco.MjData(self.model) for _ in range(slots)]
-        for data in self._data:
-            # MuJoCo reports the first warning of each kind to a file and the console; here none is the first.
-            data.warning.number[:] = 1
-        self._flags = np.zeros(slots, dtype=np.int64)
-        self.team = np.zeros(8, dtype=np.int64)
-        n, m = 2 * self.model.nv + self.model.na, self.model.nu
+        model.actuator_forcelimited[list(self.unlimited[0])] = 0
+        model.jnt_actfrclimited[list(self.unlimited[1])] = 0
+        if self.softness > 0:
+            _soften(model, self.softness)
+        n, m = 2 * model.nv + model.na, model.nu
+        self.team = np.zeros(8, dtype=np.int64)  # the words that the threads share
         self.team[kernel.TICKET] = n + m  # a job without columns left
         self._job = np.zeros(1 + (n + m) + n + 6 + n * (n + m))
-        addresses = [self._addresses(data, model, body) for data, model in zip(self._data, self._models, strict=True)]
-        self._table = np.array(addresses, dtype=np.float64)
-        self.numbers = self._numbers(mjcf.carriers if loaded else (), mjcf.turns_about)
+        self._numbers: Array | None = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return MjcfPhysics, tuple(getattr(self, field.name) for field in fields(self))
+
+    @cached_property
+    def digest(self) -> str:
+        """Of what the model is made from; whether it is loaded is told by the names of parameters."""
+        arguments = ((field, getattr(self, field.name)) for field in fields(self)[1:-1])
+        changed = {field.name: value for field, value in arguments if value != field.default}
+        return sha256(self.mjcf.xml, self.mjcf.turns_about or "", repr(changed))
+
+    @property
+    def numbers(self) -> Array:
+        """Those for the kernel, without a wrench and loads; they have addresses in the memory, which is made here."""
+        with _making:
+            if self._numbers is None:
+                self._numbers = self._with_memory()
+            return self._numbers
+
+    def _with_memory(self) -> Array:
+        model, carriers = self.model, list(self.mjcf.carriers if self.loaded else ())
+        # With loads, each slot has its own model, which may be large; filters need one slot.
+        slots = 2 if self.loaded else 2 * processors()
+        self._models = [copy.copy(model) if self.loaded else model for _ in range(slots)]
+        self._data = [mujoco.MjData(model) for _ in range(slots)]
+        self._flags, self._table = np.zeros(slots, dtype=np.int64), np.zeros((slots, kernel.SLOT))
+        for row, own_model, data in zip(self._table, self._models, self._data, strict=True):
+            # MuJoCo reports the first warning of each kind to a file and the console; here none is the first.
+            data.warning.number[:] = 1
+            arrays = {
+                kernel.QPOS: data.qpos, kernel.QVEL: data.qvel, kernel.ACT: data.act, kernel.CTRL: data.ctrl,
+                kernel.WARM: data.qacc_warmstart, kernel.QACC: data.qacc, kernel.XPOS: data.xpos,
+                kernel.XMAT: data.xmat, kernel.GEOM_XPOS: data.geom_xpos, kernel.GEOM_XMAT: data.geom_xmat,
+                kernel.XFRC_APPLIED: data.xfrc_applied[self.body], kernel.MASSES: own_model.body_mass,
+            }  # fmt: skip
+            row[list(arrays)] = [array.ctypes.data for array in arrays.values()]
+            row[[kernel.DATA, kernel.OWN_MODEL]] = data._address, own_model._address
+        joints = np.stack([model.jnt_type, model.jnt_qposadr, model.jnt_dofadr], axis=1).astype(np.float64)
+        loads = np.zeros(len(carriers)), carriers, model.body_mass[carriers]
+        entries = _functions() | {
+            kernel.FLAGS: self._flags.ctypes.data, kernel.SLOTS: self._table.ctypes.data,
+            kernel.COUNT: slots, kernel.TEAM: self.team.ctypes.data, kernel.JOB: self._job.ctypes.data,
+            kernel.MODEL: model._address, kernel.TIMESTEP: model.opt.timestep, kernel.NV: model.nv,
+            kernel.NA: model.na, kernel.JOINTS: model.njnt,
+            kernel.KEEPS: model.opt.integrator != RK4,  # RK4 ends with the stages of its last evaluation
+            kernel.LOADED: len(carriers), kernel.LOADS: kernel.TABLE + joints.size,
+        }  # fmt: skip
+        if self.mjcf.turns_about is not None:
+            entries[kernel.AXIS + AXES.index(self.mjcf.turns_about)] = 1.0
+        numbers = np.zeros(kernel.TABLE)
+        numbers[list(entries)] = list(entries.values())
+        return np.concatenate([numbers, joints.ravel(), *loads])
 
     def address(self) -> int:
         """The address of the numbers, for kernels of distances. Their model, which may be large, is not made before."""
@@ -139,37 +182,6 @@ class MjcfPhysics:
         # The other algorithm is wrong at a distance.
         exact.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
         return exact
-
-    def _addresses(self, data: mujoco.MjData, model: mujoco.MjModel, body: int) -> list[float]:
-        row = np.zeros(kernel.SLOT)
-        fields = {
-            kernel.QPOS: data.qpos, kernel.QVEL: data.qvel, kernel.ACT: data.act, kernel.CTRL: data.ctrl,
-            kernel.WARM: data.qacc_warmstart, kernel.QACC: data.qacc, kernel.XFRC_APPLIED: data.xfrc_applied[body],
-            kernel.XPOS: data.xpos, kernel.XMAT: data.xmat, kernel.GEOM_XPOS: data.geom_xpos,
-            kernel.GEOM_XMAT: data.geom_xmat, kernel.MASSES: model.body_mass,
-        }  # fmt: skip
-        for column, array in fields.items():
-            row[column] = array.ctypes.data
-        row[kernel.DATA], row[kernel.OWN_MODEL] = data._address, model._address
-        return row.tolist()
-
-    def _numbers(self, carriers: tuple[int, ...], turns_about: str | None) -> Array:
-        model = self.model
-        joints = np.stack([model.jnt_type, model.jnt_qposadr, model.jnt_dofadr], axis=1).astype(np.float64)
-        loads = np.zeros(len(carriers)), carriers, model.body_mass[list(carriers)]
-        entries = _functions() | {
-            kernel.FLAGS: self._flags.ctypes.data, kernel.SLOTS: self._table.ctypes.data,
-            kernel.COUNT: len(self._flags), kernel.TEAM: self.team.ctypes.data, kernel.JOB: self._job.ctypes.data,
-            kernel.MODEL: model._address, kernel.TIMESTEP: model.opt.timestep, kernel.NV: model.nv,
-            kernel.NA: model.na, kernel.JOINTS: model.njnt,
-            kernel.KEEPS: model.opt.integrator != RK4,  # RK4 ends with the stages of its last evaluation
-            kernel.LOADED: len(carriers), kernel.LOADS: kernel.TABLE + joints.size,
-        }  # fmt: skip
-        if turns_about is not None:
-            entries[kernel.AXIS + AXES.index(turns_about)] = 1.0
-        numbers = np.zeros(kernel.TABLE)
-        numbers[list(entries)] = list(entries.values())
-        return np.concatenate([numbers, joints.ravel(), *loads])
 
 
 def _soften(model: mujoco.MjModel, width: float) -> None:
@@ -216,15 +228,6 @@ class MjcfDynamics(Dynamics):
         self, mjcf: MjcfModel, name: str, *, body: int, obstacles: tuple[int, ...], states: Coordinates,
         controls: Coordinates,
     ) -> None:  # fmt: skip
-        self._name = name
-        self._stated: dict[str, Any] = {"body": body, "obstacles": obstacles}
-        self.functions, self.level = (), "compiled"
-        self.parameters: dict[str, float] = {}
-        self.state_coordinates, self.control_coordinates = states, controls
-        self._set_mjcf(mjcf)
-
-    def _set_mjcf(self, mjcf: MjcfModel) -> None:
-        self.mjcf, self.fixed, self._physics = mjcf, sha256(mjcf.xml, mjcf.turns_about or "", repr(self._stated)), None
         model = mjcf.model
         refusals = {
             "actuators": (model.nu == 0, "got none", "at least one <actuator> that has a control"),
@@ -234,33 +237,27 @@ class MjcfDynamics(Dynamics):
         }
         for part, (present, got, wanted) in refusals.items():
             if present:
-                raise InputError(f"{self._name}: {part}: {got}, want {wanted}")
-        for geom in np.intersect1d(self._stated["obstacles"], [model.pair_geom1, model.pair_geom2])[:1]:
-            who = model.geom(int(geom)).name
-            raise InputError(f"geom {who!r}: got an obstacle in a <contact><pair>, want contype/conaffinity instead")
+                raise InputError(f"{name}: {part}: {got}, want {wanted}")
+        self._name, self.physics = name, MjcfPhysics(mjcf, body, obstacles)
+        self.functions, self.level = (), "compiled"
+        self.state_coordinates, self.control_coordinates = states, controls
         loads = [f"{model.body(number).name}_load" for number in mjcf.carriers]
+        self.parameters: dict[str, float] = {}
         self.disturbances = dict.fromkeys([*WRENCH, *loads], 0.0)
 
+    def with_physics(self, **changed: Any) -> "MjcfDynamics":
+        """The same with other arguments of its `MjcfPhysics`, which has its own memory."""
+        dynamics = copy.copy(self)
+        dynamics.physics = replace(self.physics, **changed)
+        return dynamics
+
     @property
-    def physics(self) -> MjcfPhysics:
-        """MuJoCo's model, and memory for each thread, which are made when they are first asked for."""
-        with _making:
-            if self._physics is None:
-                self._physics = MjcfPhysics(self.mjcf, loaded=bool(self.parameters), **self._stated)
-            return self._physics
+    def mjcf(self) -> MjcfModel:
+        return self.physics.mjcf
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name not in ("_physics", "disturbed", "compiled")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        self._set_mjcf(self.mjcf)
-
-    def __copy__(self) -> "MjcfDynamics":
-        """A copy that shares MuJoCo's memory, if there is any yet."""
-        copied = object.__new__(type(self))
-        vars(copied).update({name: value for name, value in vars(self).items() if name != "disturbed"})
-        return copied
+    @property
+    def model_digest(self) -> str:
+        return self.physics.digest
 
     @property
     def name(self) -> str:
@@ -274,7 +271,7 @@ class MjcfDynamics(Dynamics):
     def disturbed(self) -> "MjcfDynamics":
         if self.parameters:
             return self
-        dynamics = self.stating()  # with its own models, which carry the loads
+        dynamics = self.with_physics(loaded=True)  # with its own models, which carry the loads
         dynamics.parameters = dict(self.disturbances)
         return dynamics
 
@@ -287,7 +284,7 @@ class MjcfDynamics(Dynamics):
 
     @property
     def places(self) -> dict[str, int]:
-        loads = int(self.physics.numbers[kernel.LOADS])
+        loads = kernel.TABLE + 3 * self.physics.model.njnt
         where = [*range(kernel.WRENCH, kernel.WRENCH + len(WRENCH)), *range(loads, loads + len(self.mjcf.carriers))]
         return {name: where[i] for i, name in enumerate(self.parameters)}
 
@@ -299,7 +296,7 @@ class MjcfDynamics(Dynamics):
         `_frictionloss`; `<geom>_friction`, sliding, of colliding geoms; `<actuator>_gear`, the largest number if there
         are several; `density` and `viscosity` of the medium. In MuJoCo's units.
         """
-        obstacles = {self.mjcf.model.geom(geom).name for geom in self._stated["obstacles"]}  # which do not collide here
+        obstacles = {self.mjcf.model.geom(geom).name for geom in self.physics.obstacles}  # which do not collide here
         entries = self.mjcf.numbers.items()
         return {name: entry.value for name, entry in entries if entry.what != "friction" or entry.part not in obstacles}
 
@@ -312,12 +309,12 @@ class MjcfDynamics(Dynamics):
         numbers = self.numbers
         for name in values:
             check_name(f"{self.name}: parameters", name, [*self.parameters, *numbers])
-        dynamics = copy.copy(self)
         disturbances = {name: check_number(name, value) for name, value in values.items() if name in self.parameters}
-        dynamics.parameters = self.parameters | disturbances
         mjcf_numbers = {name: value for name, value in values.items() if name not in disturbances}
+        dynamics = copy.copy(self)
         if mjcf_numbers:
-            dynamics._set_mjcf(self.mjcf.with_numbers(mjcf_numbers, self.name))
+            dynamics = self.with_physics(mjcf=self.mjcf.with_numbers(mjcf_numbers, self.name))
+        dynamics.parameters = self.parameters | disturbances
         return dynamics
 
     @unlogged()
@@ -359,10 +356,10 @@ class MjcfDynamics(Dynamics):
         return next((complaint for complaint in complaints if complaint), None)
 
     def softened(self, states: Array) -> Iterator[tuple[str, "MjcfDynamics"]]:
-        if "softness" in self._stated or not np.isfinite(states).all() or not self.touches(states):
+        if self.physics.softness or not np.isfinite(states).all() or not self.touches(states):
             return
         for softness in SOFTER:
-            yield f"{softness:g}", self.stating(softness=softness)
+            yield f"{softness:g}", self.with_physics(softness=softness)
 
     def approaches(self, states: Array, change: Array) -> Iterator[tuple[str, "MjcfDynamics", Array]]:
         nv = self.physics.model.nv
@@ -371,16 +368,9 @@ class MjcfDynamics(Dynamics):
             return
         approaches = Approaches(self.mjcf, states, motion)
         with contextlib.suppress(InputError):  # in a <pair> the body collides in any case
-            dynamics = self.stating(obstacles=(*self._stated["obstacles"], *approaches.body_geoms))
+            dynamics = self.with_physics(obstacles=(*self.physics.obstacles, *approaches.body_geoms))
             for words, positions in approaches:
                 yield words, dynamics, np.pad(positions, [(0, 0), (0, len(change) - nv)], constant_values=np.nan)
-
-    def stating(self, **stated: Any) -> "MjcfDynamics":
-        """The same with other arguments of its `MjcfPhysics`."""
-        dynamics = copy.copy(self)
-        dynamics._stated = self._stated | stated
-        dynamics._set_mjcf(self.mjcf)
-        return dynamics
 
     def contact_modes(self, dt: float) -> ContactModes | None:
         known = not self.parameters and ContactModes.known_for(self.physics.model)
@@ -485,7 +475,7 @@ class MjcfMemory(UserFunction):
             offset=1, values=1, with_control=False, is_memory=True,
         )  # fmt: skip
         memory.held.append((dynamics.physics, dynamics.physics.address()))
-        vars(memory).update(identity=dynamics.fixed, of_what=dynamics)
+        vars(memory).update(identity=dynamics.model_digest, of_what=dynamics)
         return memory
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -547,7 +537,7 @@ class ForceLimits(Constraint):
     def removed_from(self, dynamics: MjcfDynamics) -> MjcfDynamics:
         """Dynamics without these limits."""
         ids = [tuple(limit.id for limit in self.limits if limit.of_joint is joint) for joint in (False, True)]
-        return dynamics.stating(unlimited=tuple(ids))
+        return dynamics.with_physics(unlimited=tuple(ids))
 
     def within(self, dynamics: MjcfDynamics, state: Array, control: Array, dt: float) -> "ForceLimits":
         """These limits at all physics steps of each period, predicted by the derivatives at a state."""

@@ -492,8 +492,8 @@ class Problem(OneVersion):
         # What wraps, where the robot is, and what actuators can do: starts, errors and policies depend on them.
         parts += [f"{space.rules} {space.position} {space.plane} {space.offset}"]
         parts += [self.dynamics.control_coordinates.rules]
-        if self.dynamics.fixed:
-            parts.append(self.dynamics.fixed)
+        if self.dynamics.model_digest:
+            parts.append(self.dynamics.model_digest)
         functions = [*self.dynamics.functions]
         if isinstance(self.initial, FixedState):
             parts.append(self.initial.numbers)

@@ -360,7 +360,7 @@ def _digest_of_runs(scenario: Scenario) -> str:
     maps = [np.concatenate(robot.configuration(row)) for row in probes[0]], [robot.actuation(row) for row in probes[1]]
     spheres = robot.balls
     balls = [] if spheres is None else [spheres.radii, *(spheres.centres(dynamics, row) for row in probes[0])]
-    names = robot.name, robot.body, robot.joints, robot.actuators, robot.wheels, dynamics.fixed
+    names = robot.name, robot.body, robot.joints, robot.actuators, robot.wheels, dynamics.model_digest
     numbers = robot.drag, robot.radius, plant.timestep, robot.activations, scene.geoms, dynamics.parameters
     stated: tuple[Any, ...] = (names, numbers, scenario.near_enough(), without_addresses(str(scenario.simulator)))
     stated += (scenario.sensors,) * bool(scenario.sensors)  # folders from before there were sensors stay valid
