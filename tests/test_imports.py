@@ -61,7 +61,7 @@ FLOORS_WITHIN = {
         ("noise", "parts"),
         ("mjcf_dynamics",),
         ("collision_shape",),
-        ("control_rate", "formulas", "obstacles", "quadratic_cost", "sites", "state_bounds"),
+        ("control_rate", "force_limits", "formulas", "obstacles", "quadratic_cost", "sites", "state_bounds"),
         ("problem",),
         ("belief",),
     ),

@@ -84,7 +84,8 @@ from lqrsim.kernels.records import (
 from lqrsim.kernels.records import MEMORY as MEMORY_ROW
 from lqrsim.problem.collision_shape import SphereCenters
 from lqrsim.problem.control_rate import LastCommand, RateCost, RateLimits
-from lqrsim.problem.mjcf_dynamics import ForceLimit, ForceLimits, MjcfDynamics
+from lqrsim.problem.force_limits import ForceLimit, ForceLimits
+from lqrsim.problem.mjcf_dynamics import MjcfDynamics
 from lqrsim.problem.state_bounds import LimitCost
 from lqrsim.results.archive import sha256
 from lqrsim.scenes.scene import scene_from_xml

@@ -25,7 +25,8 @@ from lqrsim.errors import (
 )
 from lqrsim.problem.collision_shape import CollisionGeoms, MjcfBalls, ShapeInWorld
 from lqrsim.problem.control_rate import ControlRate
-from lqrsim.problem.mjcf_dynamics import ForceLimit, ForceLimits, MjcfDynamics, limited_forces
+from lqrsim.problem.force_limits import ForceLimit, ForceLimits, limited_forces
+from lqrsim.problem.mjcf_dynamics import MjcfDynamics
 from lqrsim.problem.obstacles import Clearance, ObstacleCost, SelfClearance
 from lqrsim.problem.parts import Constraint, Cost
 from lqrsim.problem.problem import FixedState, Problem
