@@ -173,7 +173,7 @@ def test_two_robots_in_a_file_are_told_apart(two: Path) -> None:
 
 def test_geoms_of_a_spec_are_in_the_order_of_their_ids(two: Path) -> None:
     """A plant finds the scene's geoms before it compiles: in bodies, replicas, frames and attached models."""
-    for mjcf in (MjcfModel.of_file(two), MjcfModel.of_file(two).complete(), *map(MjcfModel.of_file, ("arena", "cage"))):
+    for mjcf in (MjcfModel.of_file(two), MjcfModel.of_file(two).named(), *map(MjcfModel.of_file, ("arena", "cage"))):
         spec = mjcf.spec()
         for k, geom in enumerate(spec.geoms):
             geom.name = f"geom {k}"

@@ -112,7 +112,9 @@ class MjcfRobot(Robot):
         MJCF has them. In a plan they do not move.
 
     Attributes:
-      mjcf: its MJCF, with joints and actuators. scene: the scene that the robot moves in.
+      mjcf: its MJCF, with joints and actuators; `mjcf.model` is MuJoCo's model of it, as runs have it. That of plans is
+        `dynamics.physics.model`.
+      scene: the scene that the robot moves in.
     """
 
     @checked
@@ -129,18 +131,20 @@ class MjcfRobot(Robot):
         turns_about: Annotated[str, OneOf(AXES)] | None = None,
         mocap: str | None = None,
     ) -> None:
-        stated = file.mjcf if isinstance(file, Scene) else MjcfModel.of_file(file)
-        self.name, who = stated.name, f"MjcfRobot {stated.name}"
-        if stated.turns_about != turns_about:
-            stated = replace(stated, turns_about=turns_about)
-        mjcf = stated.complete() if mocap is None else stated.complete().with_mocap(mocap, who)
+        mjcf = file.mjcf if isinstance(file, Scene) else MjcfModel.of_file(file)
+        self.name, who = mjcf.name, f"MjcfRobot {mjcf.name}"
+        if mjcf.turns_about != turns_about:
+            mjcf = replace(mjcf, turns_about=turns_about)
+        mjcf = mjcf.named().lit()
+        if mocap is not None:
+            mjcf = mjcf.with_mocap(mocap, who)
         model, number = mjcf.model, mjcf.body_of(body, who)
         candidates = list(file.geoms) if isinstance(file, Scene) else obstacle_geoms(model)
-        default = in_the_way(model, candidates, number, floors=floors)
-        geoms = chosen_geoms(model, obstacles, default, who)
-        self._candidates = candidates if floors and obstacles is True else []
+        every = obstacles is True
+        geoms = in_the_way(model, candidates, number, floors=floors) if every else chosen_geoms(model, obstacles, who)
+        self._candidates = candidates if floors and every else []
         self.scene, self.mjcf = scene_of(mjcf, geoms), mjcf
-        self._stated: dict[str, Any] = {
+        self._arguments: dict[str, Any] = {
             "body": body, "position": position, "radius": radius, "outline": outline, "floors": floors,
             "turns_about": turns_about,
             "obstacles": obstacles if isinstance(obstacles, bool) else self.scene.world.names,
@@ -173,8 +177,13 @@ class MjcfRobot(Robot):
             ),
         )  # fmt: skip
         self.radius = reach_of(model, number) if radius is None else radius
-        many = not dofs and len(solid_geoms(model)) > 0 if outline is None else outline
-        self.balls = MjcfBalls(model) if many else None
+
+    @cached_property
+    def balls(self) -> MjcfBalls | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        many, model = self._arguments["outline"], self.mjcf.model
+        if many is None:
+            many = not self.dynamics.state_coordinates.position and len(solid_geoms(model)) > 0
+        return MjcfBalls(model) if many else None
 
     @cached_property
     def geoms(self) -> CollisionGeoms:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -186,8 +195,7 @@ class MjcfRobot(Robot):
         if not len(world):
             return self.geoms.in_world(self.dynamics, world)
         copy = Scene(self.mjcf.with_obstacles(world), World(), ())
-        stated: dict[str, Any] = {**self._stated, "obstacles": world.names}
-        other = MjcfRobot(copy, **stated)
+        other = MjcfRobot(copy, **{**self._arguments, "obstacles": world.names})
         # Their places in the compiled model, which differ in the last bits.
         pairs = zip(other.scene.world.obstacles, world.obstacles, strict=True)
         moved = World([replace(compiled, velocity=obstacle.velocity) for compiled, obstacle in pairs])
@@ -262,7 +270,7 @@ class MjcfRobot(Robot):
         `dynamics.numbers` has the names and values. `dynamics.with_parameters` changes the numbers for a plan alone.
         """
         changed = self.dynamics.with_parameters(**values)
-        return MjcfRobot(scene_of(changed.mjcf, self.scene.geoms), **self._stated)
+        return MjcfRobot(scene_of(changed.mjcf, self.scene.geoms), **self._arguments)
 
     def hold(self, state: npt.ArrayLike) -> Array:
         """The controls (m,) that hold the robot still, by MuJoCo's own forces: torques, or the targets of servos.
@@ -364,7 +372,7 @@ class MjcfRobot(Robot):
             them, or with False: then forces may saturate.
           control_rate: cost and limits of the rates of controls; see `Problem`.
         """
-        dynamics, model = self.dynamics, self.dynamics.physics.model
+        dynamics, model = self.dynamics, self.mjcf.model
         n, controls = len(dynamics.state_coordinates), dynamics.control_coordinates
         start, goal = check_array("start", start, (n,)), check_array("goal", goal, (n,))
         bounds = self._bounds(start, goal)
@@ -439,14 +447,14 @@ class MjcfRobot(Robot):
         Limits are springs, and an MJCF may itself be past them at rest or in a keyframe. Raises InputError for another
         start far past them, and for a goal that moves a joint past them.
         """
-        names, low, high, model = self.dynamics.state_coordinates.names, {}, {}, self.scene.model
+        names, low, high, model = self.dynamics.state_coordinates.names, {}, {}, self.mjcf.model
         for joint in self.mjcf.joints:
             if joint.limits is None:
                 continue
             begin, end = start[joint.dof], goal[joint.dof]
             positions = [model.qpos0[joint.qpos.start], *model.key_qpos[:, joint.qpos.start]]
-            stated = np.isclose(begin, positions, rtol=0, atol=1e-9).any()
-            if not stated and (complaint := joint.past_limits(begin, FAR_PAST)):
+            of_mjcf = np.isclose(begin, positions, rtol=0, atol=1e-9).any()
+            if not of_mjcf and (complaint := joint.past_limits(begin, FAR_PAST)):
                 raise InputError(f"start: {complaint}")
             if end != begin and (complaint := joint.past_limits(end, _PAST)):
                 raise InputError(f"goal: {complaint}")
@@ -473,7 +481,7 @@ class MjcfRobot(Robot):
         position = ", ".join(space.names[i] for i in space.position)
         where = f"with the position {position}" if position else "whose position is not among the states"
         lines = [
-            f"{self.name}: {len(space)} states, {len(controls)} controls, steps of {self.scene.model.opt.timestep:g} s",
+            f"{self.name}: {len(space)} states, {len(controls)} controls, steps of {self.mjcf.model.opt.timestep:g} s",
             f"  states: {listed(space.names)}",
             f"  body: {self.body}, {where}",
             *(f"    {line}" for line in ([] if space.position else self._shifted(space.names))),
@@ -495,8 +503,8 @@ class MjcfRobot(Robot):
             if joint.limits is not None and not joint.limits[0] <= rest_state[joint.dof] <= joint.limits[1]
         ]
         mounts = [
-            f"{obstacle_of[obstacle]} ({self.scene.model.body(int(self.scene.model.geom_bodyid[mount])).name})"
-            for mount, obstacle in mounting_pairs(self.scene.model, list(self.scene.geoms)).tolist()
+            f"{obstacle_of[obstacle]} ({self.mjcf.model.body(int(self.mjcf.model.geom_bodyid[mount])).name})"
+            for mount, obstacle in mounting_pairs(self.mjcf.model, list(self.scene.geoms)).tolist()
         ]
         return {
             "force limits, constraints of plans": [
@@ -546,7 +554,7 @@ class MjcfRobot(Robot):
         of a closed loop begin at the MJCF's rest, or the keyframe, and move as little as they must. Activations are
         those that hold the robot, unless they are named or the keyframe has an `act`; its `ctrl` does not count.
         """
-        model, who = self.scene.model, f"MjcfRobot {self.name}"
+        model, who = self.mjcf.model, f"MjcfRobot {self.name}"
         state = np.zeros(len(self.dynamics.state_coordinates))
         if keyframe is None:
             qpos, qvel, act = model.qpos0.copy(), np.zeros(model.nv), None
@@ -565,7 +573,7 @@ class MjcfRobot(Robot):
 
     def _closed(self, state: Array, qpos: Array, named: Iterable[str]) -> Array:
         """The positions (nv,) of a state that meet equalities and are as named, beginning with qpos (nq,)."""
-        model, names = self.scene.model, self.dynamics.state_coordinates.names
+        model, names = self.mjcf.model, self.dynamics.state_coordinates.names
         fixed = np.zeros(model.nv, dtype=bool)
         for joint in self.mjcf.joints:
             fixed[joint.dofs] = not set(names[joint.dofs]).isdisjoint(named)
@@ -585,7 +593,7 @@ class MjcfRobot(Robot):
 
     def with_closed_loops(self, states: npt.ArrayLike) -> Array:
         """The nearest states (..., n) at which all equality constraints are met, in positions and in velocities."""
-        model = self.scene.model
+        model = self.mjcf.model
         states = vectors_of("states", states, len(self.dynamics.state_coordinates))
         if not model.eq_active0.any():
             return states
@@ -600,7 +608,7 @@ class MjcfRobot(Robot):
         return corrected
 
     def state(self, qpos: npt.ArrayLike, qvel: npt.ArrayLike, near: npt.ArrayLike | None = None) -> Array:
-        model = self.scene.model
+        model = self.mjcf.model
         qpos, qvel = configuration_of(qpos, qvel, model.nq, model.nv)
         state = np.concatenate([self.mjcf.positions_of(qpos), qvel], axis=-1)
         if near is None:

@@ -338,8 +338,8 @@ class MjcfModel:
 
     # The same with changes, each a model of its own.
 
-    def complete(self) -> "MjcfModel":
-        """The same with names for all bodies, joints, geoms and actuators, and with a light, if it has none.
+    def named(self) -> "MjcfModel":
+        """The same with names for all bodies, joints, geoms and actuators.
 
         Names are `unnamed_<kind>_<number>`, counted from 0; of several free joints without one, each gets its body's.
         """
@@ -367,19 +367,32 @@ class MjcfModel:
                 if element.get("name") is None:
                     element.set("name", next(names))
                     changed = True
-        xml = ElementTree.tostring(root, encoding="unicode") if changed else self.xml
-        named = replace(self, xml=xml) if changed else self
-        has_light = any(element.tag == "light" for element in placed)
-        if has_light or "</mujoco>" not in xml or ("<attach" in xml and named.model.nlight):
-            return named
-        # The size of the whole is known when it is compiled, and the light is to be in what is compiled.
-        model = replace(self, xml=_with_light(xml, np.zeros(3))).model
-        position = model.stat.center + float(model.stat.extent) * np.array([-1.0, -1.0, 3.0])
-        completed = replace(self, xml=_with_light(xml, position))
+        return self._of(root) if changed else self
+
+    def lit(self) -> "MjcfModel":
+        """The same with a light, if it has none, and compiled: the light's place follows from the size of the whole.
+
+        It is compiled only once, with the light at the origin, which is then moved in the text and in the model alike.
+        """
+        xml, end = self.xml, self.xml.rfind("</mujoco>")
+        worlds = ElementTree.fromstring(xml).iter("worldbody") if "<light" in xml else ()
+        has_light = any(world.find(".//light") is not None for world in worlds)
+        if has_light or end < 0 or ("<attach" in xml and self.model.nlight):
+            return self
+
+        def with_light_at(pos: str) -> MjcfModel:
+            look = 'dir="0.3 0.3 -1" directional="true" diffuse=".5 .5 .5"'
+            added = f'<worldbody><light name="overview" pos="{pos}" {look} /></worldbody>'
+            return replace(self, xml=f"{xml[:end]}{added}{xml[end:]}")  # the text can be long
+
+        model = with_light_at("0 0 0").model
+        place = model.stat.center + float(model.stat.extent) * np.array([-1.0, -1.0, 3.0])
+        written = [f"{number:.6g}" for number in place]
         for field in (model.light_pos, model.light_pos0, model.light_poscom0):
-            field[-1] += [float(f"{number:.6g}") for number in position]
-        vars(completed)["model"] = model
-        return completed
+            field[-1] += np.array(written, dtype=np.float64)
+        lit = with_light_at(" ".join(written))
+        vars(lit)["model"] = model  # as its text would be compiled
+        return lit
 
     def with_mocap(self, key: str, what: str) -> "MjcfModel":
         """The same with its mocap bodies where a keyframe has them, and all else as it is.
@@ -519,15 +532,6 @@ class MjcfModel:
 
     def _of(self, root: ElementTree.Element) -> "MjcfModel":
         return replace(self, xml=ElementTree.tostring(root, encoding="unicode"))
-
-
-def _with_light(xml: str, place: Array) -> str:
-    """The MJCF with a light named overview at a place (3,)."""
-    light = {"name": "overview", "pos": "", "dir": "0.3 0.3 -1", "directional": "true", "diffuse": ".5 .5 .5"}
-    added = ElementTree.Element("worldbody")
-    ElementTree.SubElement(added, "light", light | {"pos": " ".join(f"{number:.6g}" for number in place)})
-    end = xml.rindex("</mujoco>")  # the text comes from ElementTree, and can be long
-    return f"{xml[:end]}{ElementTree.tostring(added, encoding='unicode')}{xml[end:]}"
 
 
 def _elements(root: ElementTree.Element) -> dict[str, dict[str, ElementTree.Element]]:

@@ -119,8 +119,8 @@ def load_scene(
         by noise that real ones do not feel.
     """
     of_urdf: dict[str, Any] = {"base": base, "servos": servos, "efforts": efforts, "armature": armature}
-    stated = {name: value for name, value in of_urdf.items() if value is not None}
-    mjcf = MjcfModel(*read_urdf(name_or_path, **stated)) if stated else MjcfModel.of_file(name_or_path)
+    given = {name: value for name, value in of_urdf.items() if value is not None}
+    mjcf = MjcfModel(*read_urdf(name_or_path, **given)) if given else MjcfModel.of_file(name_or_path)
     # What moves in a URDF is an MjcfRobot, which has MuJoCo's distances.
     return _with_choice(mjcf, obstacles, (*KINDS, *OTHER_KINDS) if is_urdf(name_or_path) else KINDS)
 
@@ -131,14 +131,15 @@ def scene_from_xml(xml: str, name: str, *, obstacles: Choice = True) -> Scene:
 
 
 def _with_choice(mjcf: MjcfModel, obstacles: Choice, kinds: Collection[str] = KINDS) -> Scene:
-    geoms = chosen_geoms(mjcf.model, obstacles, obstacle_geoms(mjcf.model), f"scene {mjcf.name}")
+    every = obstacles is True
+    geoms = obstacle_geoms(mjcf.model) if every else chosen_geoms(mjcf.model, obstacles, f"scene {mjcf.name}")
     return scene_of(mjcf, geoms, kinds)
 
 
-def chosen_geoms(model: mujoco.MjModel, obstacles: Choice, default: Sequence[int], what: str) -> list[int]:
-    """Ids of the geoms that the `obstacles=` of `load_scene` chooses; `default` for True."""
-    if isinstance(obstacles, bool):
-        return list(default) if obstacles else []
+def chosen_geoms(model: mujoco.MjModel, obstacles: Choice, what: str) -> list[int]:
+    """Ids of the geoms that the `obstacles=` of `load_scene` chooses, other than True."""
+    if obstacles is False:
+        return []
     fixed = np.flatnonzero(model.body_weldid[model.geom_bodyid] == 0).tolist()
     if callable(obstacles):
         try:
