@@ -881,7 +881,7 @@ def of_constraint(term: ls.types.ConstraintTerm, equality: int = 0, x: Array = X
     data, source = numbers_of(term), source_of(augmented_lagrangian, SHARED=term.shared)
     pairs = {"constraint_value": (term.code, "value"), "constraint_slope": (term.code, "slope")}
     if term.shared:
-        pairs |= {name: (term.code, name) for name in ("places", "places_jacobian")}
+        pairs |= {name: (term.code, name) for name in ("shared_values", "shared_jacobian")}
     w = len(x) + len(u)
     source, sizes = source.filled(**pairs), {"N": len(x), "M": len(u), "W": w, "EQUALITY": equality}
     multipliers = np.concatenate([[3.0, term.rows, 0.0, 0.01], np.linspace(0.0, 2.0, 4 * term.rows)])

@@ -16,8 +16,9 @@ at a step, the first step at which they act, the margin, which is the tolerance,
 and from MULTIPLIERS on lambda, step by step. The indices are names in `declarations.py`; Python uses the class
 `ConstraintMultipliers` in `solvers/compiled.py`.
 
-A constraint whose rows share numbers, such as the centres of a robot's balls, computes them once per step, by `places`.
-Its value and its slope then take the numbers (SHARED,) and their Jacobian (SHARED, N) in place of state and control.
+A constraint whose rows share numbers, such as the centres of a robot's balls, computes them once per step, by
+`shared_values`. Its value and its slope then take the numbers (SHARED,) and their Jacobian (SHARED, N) in place of
+state and control.
 """
 
 from math import inf
@@ -34,8 +35,8 @@ from lqrsim.kernels.declarations import (
     W,
     constraint_slope,
     constraint_value,
-    places,
-    places_jacobian,
+    shared_jacobian,
+    shared_values,
     stack,
     zeros,
 )
@@ -50,7 +51,7 @@ def augment(x, u, t, data, multipliers, hessian, gradient):
         return 0.0
     shared, jacobian = stack(SHARED), zeros(SHARED, N)
     if SHARED:
-        places_jacobian(x, data, shared, jacobian)
+        shared_jacobian(x, data, shared, jacobian)
     y, v = (shared, jacobian) if SHARED else (x, u)
     slope, total = stack(W), 0.0
     for row in range(int(multipliers[ROWS])):
@@ -73,7 +74,7 @@ def augmentation(x, u, t, data, multipliers):
         return 0.0
     shared, total = stack(SHARED), 0.0
     if SHARED:
-        places(x, data, shared)
+        shared_values(x, data, shared)
     for row in range(int(multipliers[ROWS])):
         _, _, value = force_of(shared if SHARED else x, u, t, row, data, multipliers)
         total += value
@@ -98,7 +99,7 @@ def constraint_values(x, u, t, acts, data, multipliers, values):
     """
     shared, rows = stack(SHARED), int(multipliers[ROWS])
     if SHARED:
-        places(x, data, shared)
+        shared_values(x, data, shared)
     for row in range(rows):
         values[rows * t + row] = 0.0 if EQUALITY else inf
         if acts and t >= multipliers[FIRST]:
@@ -109,6 +110,6 @@ def add_slope(x, u, t, row, data, gradient):
     """Add the gradient (W,) of one of a constraint's values."""
     shared, jacobian = stack(SHARED), zeros(SHARED, N)
     if SHARED:
-        places_jacobian(x, data, shared, jacobian)
+        shared_jacobian(x, data, shared, jacobian)
     y, v = (shared, jacobian) if SHARED else (x, u)
     constraint_slope(y, v, t, row, data, gradient)

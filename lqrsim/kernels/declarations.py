@@ -181,15 +181,28 @@ def constraint_slope(x, u, t, row, data, gradient) -> None:
 def places(x, data, out) -> None:
     """Write the centres of a robot's balls, three coordinates each, ball by ball.
 
-    `user_functions.py`, `mjcf_dynamics.py`; for costs and constraints of a residual, its rows: `residual` of
-    `mjcf_dynamics.py`, and of the files of costs and constraints.
+    `user_functions.py`, `mjcf_dynamics.py`.
     """
 
 
 def places_jacobian(x, data, out, slopes) -> None:
     """Write the centres, and the structurally nonzero entries of their Jacobian (3 balls, N).
 
-    `differences.py`, `user_functions.py`; `residual_jacobian` beside the residual.
+    `differences.py`, `user_functions.py`.
+    """
+
+
+def shared_values(x, data, out) -> None:
+    """Write the numbers that all rows of a cost or a constraint share.
+
+    `residual` of the files of costs and constraints, and of `mjcf_dynamics.py`; or `places`, of a robot's balls.
+    """
+
+
+def shared_jacobian(x, data, out, slopes) -> None:
+    """Write these numbers, and the structurally nonzero entries of their Jacobian (any, N).
+
+    `residual_jacobian`, `places_jacobian`.
     """
 
 

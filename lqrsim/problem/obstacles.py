@@ -12,7 +12,7 @@ from lqrsim.annotations import Finite, NonNegative, Positive, checked
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import UserFunction
 from lqrsim.errors import Array, InputError, check_array, check_number, real
-from lqrsim.kernels.declarations import ROW, N, exact, places, places_jacobian, power_of_two, stack, zeros
+from lqrsim.kernels.declarations import ROW, N, exact, power_of_two, shared_jacobian, shared_values, stack, zeros
 from lqrsim.kernels.distances import hull_distance, signed_distance, signed_distance_derivatives
 from lqrsim.problem.collision_shape import (
     MOST_ROWS,
@@ -88,8 +88,8 @@ def _placed(shape: ShapeInWorld, numbers: Array) -> tuple[Source, Array, tuple[U
     kernels = source_of(
         __name__, AT=centers.numbers, BALLS=shape.balls, PARTS=len(shape.radii), AXES=axes, HULLS=int(bool(shape.hulls))
     )
-    filled = kernels.filled(places=centers.code, places_jacobian=centers.code)
-    return filled, np.concatenate([centers.data, numbers]), centers.functions
+    shared = {"shared_values": (centers.code, "places"), "shared_jacobian": (centers.code, "places_jacobian")}
+    return kernels.filled(**shared), np.concatenate([centers.data, numbers]), centers.functions
 
 
 def each_once(terms: Sequence[KeepsClear]) -> list[KeepsClear]:
@@ -319,25 +319,26 @@ class SelfClearance(Constraint):
             )
 
 
-# The kernels. The robot is a point at its position, or a set of parts: balls, or convex hulls of some of these. Of a
-# Clearance, `clearance_value` and `clearance_slope` take the centres of all balls and their Jacobian in place of state
-# and control; see `augmented_lagrangian.py`.
-#
-# From AT on, `data` has the numbers below; of a Clearance then the margins, step by step; then tables of obstacles,
-# which may move, step by step. The last margins and the last table hold from their step on. AT is 0 for a point. For
-# balls, the entries before AT are those that `places` reads.
+# The kernels. Their numbers begin in `data` at AT, after those that `shared_values` reads: sharpness and weight of a
+# cost, and what one of two layouts says.
 AT = 0
-# From there on: sharpness and weight of a cost, or numbers of steps with margins and of margins at a step; numbers of
-# obstacles, and of steps with a table of these; then the radius of each part, or of the point; for hulls the first ball
-# of each, and the end of the last.
 SHARPNESS, WEIGHT = 0, 1
+
+# Of geoms: the distances of the geoms are a residual, and the cost has a `loss` of each.
+FARTHEST = 2  # the distance beyond which there is no cost
+
+# Of balls: the robot is a point at its position, or a set of parts: balls, or convex hulls of some of these. The shared
+# values are the centres of all balls; `clearance_value` and `clearance_slope` take them and their Jacobian in place of
+# state and control, see `augmented_lagrangian.py`. A Clearance begins with numbers of steps with margins and of margins
+# at a step. Then follow numbers of obstacles, and of steps with a table of these; the radius of each part, or of the
+# point; for hulls the first ball of each, and the end of the last; of a Clearance the margins, step by step; and tables
+# of obstacles, which may move, step by step. The last margins and the last table hold from their step on.
 STEPS, EACH = 0, 1
 OBSTACLES, TABLES, RADII = 2, 3, 4
-FARTHEST = 2  # for geoms; see `loss`
 BALLS = 0  # number of balls; 0 for a point
 PARTS = 1  # number of balls, or of hulls
 HULLS = 0  # 1 if the parts are hulls of balls
-AXES = (0, 1, 2)  # states that are the position, two in a plane with third coordinate 0; or states that move the balls
+AXES = (0, 1, 2)  # states that move the robot: of a point its position, two in a plane with third coordinate 0
 BLOCK = 8  # number of obstacles whose exponentials are computed together, as vectors
 LOG2_E = 1.4426950408889634
 LN2_HIGH, LN2_LOW = 0.693145751953125, 1.4286068203094173e-06  # ln 2 in two parts; products with the first are exact
@@ -351,7 +352,7 @@ def value(x, u, t, data):
         tables = tables_at(t, data)
         if BALLS:
             centres = stack(3 * BALLS)
-            places(x, data, centres)
+            shared_values(x, data, centres)
             if HULLS:
                 for k in range(PARTS):
                     total += cost_of_hull(centres, k, tables, data)
@@ -369,11 +370,10 @@ def derivatives(x, u, t, data, hessian, gradient):
     """Add the Hessian (W, W) and the gradient (W,), and return the cost. The curvature of the centres is left out."""
     total = 0.0
     if t > 0:
-        sharpness, tables = data[AT + SHARPNESS], tables_at(t, data)
-        force, stiffness = stack(3), stack(3, 3)
+        force, stiffness, tables = stack(3), stack(3, 3), tables_at(t, data)
         if BALLS:
             centres, jacobian = stack(3 * BALLS), zeros(3 * BALLS, N)
-            places_jacobian(x, data, centres, jacobian)
+            shared_jacobian(x, data, centres, jacobian)
             if HULLS:
                 for k in range(PARTS):
                     total += derivatives_of_hull(centres, jacobian, k, tables, data, hessian, gradient)
@@ -383,29 +383,29 @@ def derivatives(x, u, t, data, hessian, gradient):
                     total += derivatives_of_ball(
                         centres[c], centres[c + 1], centres[c + 2], radius, tables, data, force, stiffness
                     )
-                    add_in_states(sharpness, force, stiffness, jacobian, c, hessian, gradient)
+                    add_in_states(force, stiffness, jacobian, c, hessian, gradient)
         else:
             height = x[AXES[2]] if len(AXES) == 3 else 0.0
             total = derivatives_of_ball(
                 x[AXES[0]], x[AXES[1]], height, data[AT + RADII], tables, data, force, stiffness
             )
             for j in range(len(AXES)):
-                gradient[AXES[j]] += sharpness * force[j]
+                gradient[AXES[j]] += force[j]
                 for k in range(len(AXES)):
-                    hessian[AXES[j], AXES[k]] += sharpness * stiffness[j, k]
+                    hessian[AXES[j], AXES[k]] += stiffness[j, k]
     return total
 
 
-def add_in_states(sharpness, force, stiffness, jacobian, first, hessian, gradient):
-    """Add the derivatives in the states of a ball's cost, given those in its centre, divided by the sharpness."""
+def add_in_states(force, stiffness, jacobian, first, hessian, gradient):
+    """Add the derivatives in the states of a ball's cost, given those in its centre."""
     product = stack(3)
     for a in range(len(AXES)):
         for j in range(3):
             product[j] = 0.0
             for m in range(3):
-                product[j] += sharpness * stiffness[j, m] * jacobian[first + m, AXES[a]]
+                product[j] += stiffness[j, m] * jacobian[first + m, AXES[a]]
         for j in range(3):
-            gradient[AXES[a]] += sharpness * force[j] * jacobian[first + j, AXES[a]]
+            gradient[AXES[a]] += force[j] * jacobian[first + j, AXES[a]]
         for b in range(len(AXES)):
             for j in range(3):
                 hessian[AXES[a], AXES[b]] += jacobian[first + j, AXES[b]] * product[j]
@@ -475,16 +475,16 @@ def cost_of_ball(a, b, c, radius, table, data):
 
 
 def derivatives_of_ball(a, b, c, radius, table, data, force, stiffness):
-    """The cost of a ball at (a, b, c); write its gradient (3,) and Hessian (3, 3) there, divided by the sharpness."""
+    """The cost of a ball at (a, b, c); write its gradient (3,) and Hessian (3, 3) there."""
     slope, curve, slopes, curves = stack(BLOCK, 3), stack(BLOCK, 3, 3), zeros(3), zeros(3, 3)
-    costs, count, total = stack(BLOCK), int(data[AT + OBSTACLES]), 0.0
+    sharpness, costs, count, total = data[AT + SHARPNESS], stack(BLOCK), int(data[AT + OBSTACLES]), 0.0
     for block in range(0, count, BLOCK):
         size = min(BLOCK, count - block)
         for i in range(BLOCK):
             costs[i] = 0.0
         for i in range(size):
             distance = signed_distance_derivatives(data, table + ROW * (block + i), a, b, c, slope[i], curve[i])
-            costs[i] = -data[AT + SHARPNESS] * (distance - radius)
+            costs[i] = -sharpness * (distance - radius)
         for i in range(BLOCK):
             costs[i] = exponential(costs[i])
         for i in range(size):
@@ -493,19 +493,18 @@ def derivatives_of_ball(a, b, c, radius, table, data, force, stiffness):
             for j in range(3):
                 slopes[j] -= cost * slope[i, j]
                 for k in range(3):
-                    curves[j, k] += cost * (data[AT + SHARPNESS] * slope[i, j] * slope[i, k] - curve[i, j, k])
+                    curves[j, k] += cost * (sharpness * slope[i, j] * slope[i, k] - curve[i, j, k])
     for j in range(3):
-        force[j] = slopes[j]
+        force[j] = sharpness * slopes[j]
         for k in range(3):
-            stiffness[j, k] = curves[j, k]
+            stiffness[j, k] = sharpness * curves[j, k]
     return total
 
 
 def loss(distance, row, data):
     """The cost of a distance of geoms, its first and its second derivative.
 
-    From AT on, `data` has the sharpness, the weight, and the distance beyond which there is no cost. The tangent there
-    is subtracted, so that neither the cost nor its slope jumps.
+    The tangent at the farthest distance is subtracted, so that neither the cost nor its slope jumps.
     """
     sharpness, weight, farthest = data[AT + SHARPNESS], data[AT + WEIGHT], data[AT + FARTHEST]
     cost, least, beyond = exponential(-sharpness * distance), exponential(-sharpness * farthest), farthest - distance

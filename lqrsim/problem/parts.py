@@ -22,7 +22,7 @@ from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import Term, address_of
 from lqrsim.errors import Array, InputError, brief, check_count, check_items, check_kind, excerpt
-from lqrsim.kernels.declarations import N, loss, places, places_jacobian, stack
+from lqrsim.kernels.declarations import N, loss, shared_jacobian, shared_values, stack
 from lqrsim.kernels.linear_algebra import clear
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.solution_parts import Horizon, Trajectory, left_after
@@ -59,8 +59,8 @@ class Residual(Term):
         return len(self.parts)
 
     def filling(self, kernel: Source) -> Source:
-        """A kernel of costs or constraints whose open function `places` is filled with the residual."""
-        return kernel.filled(places=(self.code, "residual"), places_jacobian=(self.code, "residual_jacobian"))
+        """A kernel of costs or constraints whose open function `shared_values` is filled with the residual."""
+        return kernel.filled(shared_values=(self.code, "residual"), shared_jacobian=(self.code, "residual_jacobian"))
 
 
 @checked
@@ -129,8 +129,9 @@ class ConstraintTerm(Term):
         one. By default rows have their indices.
       uses_control: whether the entries depend on u; if so, they do not act at the last knot.
       shared: number of values that all rows share, such as the centres of balls, computed once per step. Above 0, the
-        source must define `places` and `places_jacobian`, as in `SphereCenters`, and `value` and `slope` get these
-        values (shared,) and their derivatives (shared, n) in place of x and u.
+        source must define `shared_values(x, data, out)` and `shared_jacobian(x, data, out, slopes)`, as the `residual`
+        of a Residual, and `value` and `slope` get these values (shared,) and their derivatives (shared, n) in place of
+        x and u.
       convex: whether the states that satisfy an inequality form a convex set: there is then no way round.
       ranges: (rows,) the distance between the two bounds of a value that has both, infinite for others: the most that
         counts as a typical change.
@@ -153,7 +154,7 @@ class ConstraintTerm(Term):
 
     @property
     def _defines(self) -> Mapping[str, int]:
-        of_all = {"places": 3, "places_jacobian": 4} if self.shared else {}
+        of_all = {"shared_values": 3, "shared_jacobian": 4} if self.shared else {}
         return {"value": 5, "slope": 6, **of_all}
 
     @property
@@ -465,7 +466,7 @@ class PlainTerm:
         self.states, self.size = states, states + controls
         named = term.functions[0].parameters if term.functions else ()
         parameters = dict(zip(named, term.data.tolist(), strict=False))
-        wanted = [name for name in ("derivatives", "value", "slope", "places_jacobian") if term.code.has(name)]
+        wanted = [name for name in ("derivatives", "value", "slope", "shared_jacobian") if term.code.has(name)]
         sizes, calls = {"N": states, "M": controls}, [function.plain_call(parameters) for function in term.functions]
         self._functions = plain_functions(term.code, sizes, wanted, calls)
         places = [address_of(function) if function.is_memory else float(i) for i, function in enumerate(term.functions)]
@@ -493,7 +494,7 @@ class PlainTerm:
         if not self.shared:
             return x, u
         at, moves = np.zeros(self.shared), np.zeros((self.shared, self.states))
-        self._functions["places_jacobian"](x, self._data, at, moves)
+        self._functions["shared_jacobian"](x, self._data, at, moves)
         return at, moves
 
 
@@ -534,9 +535,9 @@ def by_name(
     return {name: check(f"{who}: {excerpt(name)}", value) for name, value in {**stated, **named}.items()}
 
 
-# The kernels of residuals. `places` and `places_jacobian` are the residual, with whose data `data` begins. Of a
-# constraint it has, from AT on, the numbers below, and the table of what is subtracted from the rows, step by step; the
-# last ones hold from their step on.
+# The kernels of residuals. The shared values are the residual, with whose data `data` begins. Of a constraint it has,
+# from AT on, the numbers below, and the table of what is subtracted from the rows, step by step; the last ones hold
+# from their step on.
 ROWS = 1  # number of rows
 LEADING_STATES = 1  # number of states, from the first on, that the residual depends on
 FIRST_STEP = 0  # the first step at which a cost acts: 1 for what cannot change at a given start
@@ -550,7 +551,7 @@ def value(x, u, t, data):
     total = 0.0
     if t >= FIRST_STEP:
         residual = stack(ROWS)
-        places(x, data, residual)
+        shared_values(x, data, residual)
         for row in range(ROWS):
             cost, _, _ = loss(residual[row], row, data)
             total += cost
@@ -563,7 +564,7 @@ def derivatives(x, u, t, data, hessian, gradient):
     if t >= FIRST_STEP:
         residual, moves = stack(ROWS), stack(ROWS, N)
         clear(moves, ROWS, N)
-        places_jacobian(x, data, residual, moves)
+        shared_jacobian(x, data, residual, moves)
         for row in range(ROWS):
             cost, slope, curvature = loss(residual[row], row, data)
             total += cost
@@ -575,13 +576,13 @@ def derivatives(x, u, t, data, hessian, gradient):
     return total
 
 
-def row_value(at, u, t, row, data):
+def row_value(residual, u, t, row, data):
     """The row minus its number, given the whole residual."""
     steps, each, column = int(data[AT + TABLE_ROWS]), int(data[AT + EACH]), int(data[AT + COLUMNS + row])
-    return at[row] - data[AT + COLUMNS + ROWS + min(t, steps - 1) * each + column]
+    return residual[row] - data[AT + COLUMNS + ROWS + min(t, steps - 1) * each + column]
 
 
-def row_slope(at, jacobian, t, row, data, gradient):
+def row_slope(residual, jacobian, t, row, data, gradient):
     """Add its gradient, given the whole residual and its derivatives in the states."""
     for i in range(N):
         gradient[i] += jacobian[row, i]

@@ -242,7 +242,7 @@ def about_state(term: CostTerm, state: Array) -> CostTerm:
 # each row, then `weight` (size, size) for each row. A single row, or the last one, holds from its step on.
 CONTROL = False  # whether z is the control
 BY_KNOT = False  # whether there are rows for knots; else `data` is `about` and `weight`
-ABOUTS, WEIGHTS, ROWS = 0, 1, 2
+ABOUTS, WEIGHTS, NUMBERS = 0, 1, 2
 
 
 def value(x, u, t, data):
@@ -275,12 +275,12 @@ def derivatives(x, u, t, data, hessian, gradient):
 def about_at(t, size, data):
     """The index at which the reference of a step begins."""
     if BY_KNOT:
-        return ROWS + size * min(t, int(data[ABOUTS]) - 1)
+        return NUMBERS + size * min(t, int(data[ABOUTS]) - 1)
     return 0
 
 
 def weight_at(t, size, data):
     """The index at which the weight of a step begins."""
     if BY_KNOT:
-        return ROWS + size * int(data[ABOUTS]) + size * size * min(t, int(data[WEIGHTS]) - 1)
+        return NUMBERS + size * int(data[ABOUTS]) + size * size * min(t, int(data[WEIGHTS]) - 1)
     return size

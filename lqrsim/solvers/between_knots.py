@@ -26,8 +26,8 @@ from lqrsim.kernels.declarations import (
     W,
     constraint_slope,
     constraint_value,
-    places,
-    places_jacobian,
+    shared_jacobian,
+    shared_values,
     stack,
     zeros,
 )
@@ -296,7 +296,7 @@ class WithinPeriods(Constraint):
         filled = {"constraint_value": (term.code, "value"), "constraint_slope": (term.code, "slope")}
         filled |= {name: (dynamics.step_source, name) for name in ("advance", "step_jacobian")}
         if term.shared:
-            filled |= {name: (term.code, name) for name in ("places", "places_jacobian")}
+            filled |= {name: (term.code, name) for name in ("shared_values", "shared_jacobian")}
         return replace(
             term, source=kernel.filled(**filled), data=np.concatenate([term.data, numbers]), rows=TIMES * term.rows,
             describe=lambda row: f"{term.describe(row % term.rows)}, between the knots", names=TIMES * term.names,
@@ -362,7 +362,7 @@ def value_at_state(z, u, t, row, data):
     if not SHARED:
         return constraint_value(z, u, t, row, data)
     shared = stack(SHARED)
-    places(z, data, shared)
+    shared_values(z, data, shared)
     return constraint_value(shared, u, t, row, data)
 
 
@@ -370,7 +370,7 @@ def slope_at_state(z, u, t, row, data, gradient):
     """Add its gradient (W,) at a state."""
     if SHARED:
         shared, moves = stack(SHARED), zeros(SHARED, N)
-        places_jacobian(z, data, shared, moves)
+        shared_jacobian(z, data, shared, moves)
         constraint_slope(shared, moves, t, row, data, gradient)
     else:
         constraint_slope(z, u, t, row, data, gradient)

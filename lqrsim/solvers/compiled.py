@@ -129,7 +129,7 @@ def _constraint_functions(constraints: tuple[tuple[Source, int, bool, bool], ...
         pairs = {"constraint_value": (code, "value"), "constraint_slope": (code, "slope")}
         source = source_of(augmented_lagrangian, SHARED=shared)
         if shared:
-            pairs |= {name: (code, name) for name in ("places", "places_jacobian")}
+            pairs |= {name: (code, name) for name in ("shared_values", "shared_jacobian")}
         module = module_of(source.filled(**pairs), f"a constraint: {code.what}", **dict(sizes), EQUALITY=int(equality))
         addresses = module.addresses("augment", "augmentation", "constraint_values", "add_slope")
         rows.append([*addresses, float(uses_control)])
