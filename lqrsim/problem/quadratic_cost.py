@@ -97,26 +97,29 @@ class _SquareCost(Cost):
 
     def _in(self, dynamics: Dynamics) -> Self:
         space = dynamics.control_coordinates if self.controls else dynamics.state_coordinates
-        if self._numbers is None:
-            weight = self._arguments["weight"]
-            if self.controls and isinstance(weight, Mapping):
-                weighed = space._by_name(f"{self.name}: weight", weight, _number_or_column)
-                missing = [name for i, name in enumerate(space.names) if i not in weighed]
-                if missing:
-                    got = f"none for {', '.join(missing)}"
-                    raise InputError(f"{self.name}: weight: got {got}, want one for each control")
-            fields = {
-                field: _by_name(space, f"{self.name}: {field}", given) if isinstance(given, Mapping) else given
-                for field, given in self._arguments.items()
-            }
-            if isinstance(weight, Mapping) and np.ndim(fields["weight"]) == 2:  # diagonals, one for each knot
-                fields["weight"] = fields["weight"][:, :, None] * np.eye(len(space))
-            return self._with(*self._checked(**fields))._in(dynamics)
-        size = self.weight.shape[-1]
+        cost = self if self._numbers is not None else self._with(*self._ordered(space))
+        size = cost.weight.shape[-1]
         if size != len(space):
             kind = "controls" if self.controls else "states"
             raise InputError(f"{self.name}: weight: got size {size}, want {len(space)}, the number of {kind}")
-        return self
+        return cost
+
+    def _ordered(self, space: Coordinates) -> tuple[Array, Array]:
+        """Weight and reference, as `_checked`, with numbers by name in the order of the states or controls."""
+        weight = self._arguments["weight"]
+        if self.controls and isinstance(weight, Mapping):
+            weighed = space._by_name(f"{self.name}: weight", weight, _number_or_column)
+            missing = [name for i, name in enumerate(space.names) if i not in weighed]
+            if missing:
+                got = f"none for {', '.join(missing)}"
+                raise InputError(f"{self.name}: weight: got {got}, want one for each control")
+        fields = {
+            field: _by_name(space, f"{self.name}: {field}", given) if isinstance(given, Mapping) else given
+            for field, given in self._arguments.items()
+        }
+        if isinstance(weight, Mapping) and np.ndim(fields["weight"]) == 2:  # diagonals, one for each knot
+            fields["weight"] = fields["weight"][:, :, None] * np.eye(len(space))
+        return self._checked(**fields)
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
         cost = self._in(dynamics)
