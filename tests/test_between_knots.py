@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 import lqrsim as ls
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.errors import Array
-from lqrsim.problem.parts import PlainTerm
+from lqrsim.problem.problem import PlainTerm
 from lqrsim.solvers import between_knots as solver
 from lqrsim.solvers.between_knots import TIMES, WithinPeriods
 

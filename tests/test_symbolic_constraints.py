@@ -12,7 +12,7 @@ from whole_problems.claims import contradictions
 
 import lqrsim as ls
 from lqrsim.errors import Array, InputError
-from lqrsim.problem.parts import PlainTerm
+from lqrsim.problem.problem import PlainTerm
 from lqrsim.results.solution_parts import Status
 
 anything: Any = ls  # whose types nobody checks

@@ -11,8 +11,8 @@ from lqrsim.annotations import Bounds, Line, NonNegative, Positive, Seed, checke
 from lqrsim.codegen.user_functions import Term, UserFunction, first_numbers
 from lqrsim.errors import Array, InputError
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.problem.parts import CostTerm, PlainTerm, terms_of
-from lqrsim.problem.problem import FixedState, Problem
+from lqrsim.problem.parts import CostTerm, terms_of
+from lqrsim.problem.problem import FixedState, PlainTerm, Problem
 
 STEP = 6e-6  # step of difference quotients, relative to numbers above 1
 _Points = Sequence[tuple[Array, Array]]  # states (n,) and controls (m,)

@@ -4,24 +4,22 @@ The structure of a term is source text, its numbers are data. `+` composes costs
 nonnegative, or zero, besides the limits of the controls.
 
 To add a kind, state it as a formula with `SymbolicCost` or `SymbolicConstraint`; or subclass `Cost` or `Constraint` in
-a file of its own, with its kernel, and write `bind`.
+a file of its own, with its kernel, and write `bind`. The `HuberDistance` of docs/stating_a_system.md is one to copy.
 """
 
 import abc
 import functools
 import operator
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Generic, NoReturn, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Generic, NoReturn, Self, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from lqrsim.annotations import Index, Want, checked
-from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.sources import Source, source_of
-from lqrsim.codegen.user_functions import Term, address_of
-from lqrsim.errors import Array, InputError, brief, check_count, check_items, check_kind, excerpt
+from lqrsim.codegen.user_functions import Term
+from lqrsim.errors import Array, InputError, brief, check_count, check_kind
 from lqrsim.kernels.declarations import N, loss, shared_jacobian, shared_values, stack
 from lqrsim.kernels.linear_algebra import clear
 from lqrsim.problem.dynamics import Dynamics
@@ -34,7 +32,6 @@ if TYPE_CHECKING:
 EQUALITY_TOLERANCE = 1e-6  # tolerance of equalities, unless `constraint_tolerance` is smaller
 STEPS = ("all", "final")  # the steps at which a constraint can act
 Side = float | Array  # a bound, or one for each knot, (K,)
-_Value = TypeVar("_Value")
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +115,8 @@ class CostTerm(Term):
 @checked
 @dataclass(frozen=True, eq=False)
 class ConstraintTerm(Term):
-    """A constraint, made for one system: numbers at each step that must be nonnegative, or zero.
+    """A constraint, for one system: `rows` numbers at each step, or at the last alone if it is `final_only`, that must
+    be nonnegative, or zero if it is an `equality`.
 
     The source defines `value(x, u, t, row, data)`, which returns one of the numbers, and `slope(x, u, t, row, data,
     gradient)`, which *adds* its gradient (n+m,), states before controls.
@@ -195,32 +193,20 @@ _BoundTerm = TypeVar("_BoundTerm", bound=Term)
 class ProblemPart(abc.ABC, Generic[_BoundTerm]):
     """A cost or a constraint, which can be bound to any system that it fits.
 
-    All that others ask of one is a method here, in `Cost` or in `Constraint`, with the answer of most; a kind with
-    another answer overrides it.
+    A kind writes `bind`. The rest are answers that most kinds share; a kind with another answer overrides it.
     """
 
     @abc.abstractmethod
     def bind(self, dynamics: Dynamics) -> _BoundTerm:
         """Bind the term to a system."""
 
-    @property
-    def by_knot(self) -> bool:
-        """Whether it has other numbers at each knot; initial and final costs may not."""
-        return False
+    def _bind_at(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> _BoundTerm:
+        """Bind the term to a system, for a problem.
 
-    @property
-    def moving(self) -> bool:
-        """Whether it changes with time."""
-        return self.by_knot
-
-    @property
-    def kept_clear(self) -> "KeepsClear | None":
-        """The obstacles that it keeps the robot clear of, with the robot's shape; None for others."""
-        return None
-
-    def off_place(self, dynamics: Dynamics, states: Array) -> dict[str, Array]:
-        """How far parts, such as a gripper's site, are off their places, at states (K, n): name -> (K,) in m or rad."""
-        return {}
+        Args:
+          times: (T+1,) in s, of the knots. goals: the final values that constraints require of states, by index.
+        """
+        return self.bind(dynamics)
 
     def with_added_state(self, dynamics: Dynamics) -> Self:
         """The same for a system with one more state, the last, of which it is independent: for a free duration, and for
@@ -228,6 +214,11 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
         """
         got = f"a {type(self).__name__} beside one of them, which cannot have one more state"
         raise InputError(f"duration and control_rate: got {got}, want none")
+
+    @property
+    def by_knot(self) -> bool:
+        """Whether it has other numbers at each knot; initial and final costs may not."""
+        return False
 
     @checked
     def ahead(self, steps: Index, *, horizon: Horizon = "shrinking") -> Self:
@@ -245,9 +236,19 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
         """The same with each array of rows for knots as `select` leaves it; for what has such rows."""
         raise InputError(f"{type(self).__name__}: got rows for knots, but no method ahead, want both")
 
-    def _stated(self) -> Mapping[str, object]:
-        """The arguments that it was made from, by name."""
-        return {name: value for name, value in vars(self).items() if not name.startswith("_")}
+    @property
+    def moving(self) -> bool:
+        """Whether it changes with time."""
+        return self.by_knot
+
+    @property
+    def kept_clear(self) -> "KeepsClear | None":
+        """The obstacles that it keeps the robot clear of, with the robot's shape; None for others."""
+        return None
+
+    def off_place(self, dynamics: Dynamics, states: Array) -> dict[str, Array]:
+        """How far parts, such as a gripper's site, are off their places, at states (K, n): name -> (K,) in m or rad."""
+        return {}
 
     def __repr__(self) -> str:
         parts = [
@@ -257,17 +258,13 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
         ]
         return f"{type(self).__name__}({', '.join(parts)})"
 
+    def _stated(self) -> Mapping[str, object]:
+        """The arguments that it was made from, by name."""
+        return {name: value for name, value in vars(self).items() if not name.startswith("_")}
+
     def _brief(self, name: str, value: object) -> str:
         """An argument as it is printed."""
         return brief(value)
-
-    def _bind_at(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> _BoundTerm:
-        """Bind the term to a system, for a problem.
-
-        Args:
-          times: (T+1,) in s, of the knots. goals: the final values that constraints require of states, by index.
-        """
-        return self.bind(dynamics)
 
 
 class Cost(ProblemPart[CostTerm]):
@@ -324,7 +321,8 @@ class CostSum(Cost):
     def _refused(self) -> NoReturn:
         raise InputError("cost: got a sum of costs, want a single term: bind the `terms` one by one")
 
-    kept_clear = state_reference = control_reference = contact_curvature = property(_refused)
+    kept_clear = state_reference = property(_refused)  # pyright: ignore[reportIncompatibleMethodOverride]
+    control_reference = contact_curvature = property(_refused)  # pyright: ignore[reportIncompatibleMethodOverride]
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
         self._refused()
@@ -376,7 +374,7 @@ def weighing_obstacles(cost: Cost, factor: float) -> CostSum:
 
 
 class Constraint(ProblemPart[ConstraintTerm]):
-    """A constraint."""
+    """Numbers that must be nonnegative, or zero, at each step or at the last; `bind` makes them for a system."""
 
     # The largest violation, in its unit, of a plan along which it is refined; 0 if `_refined` returns no other.
     _rough: float = 0.0
@@ -456,83 +454,6 @@ def allowed_violation(term: ConstraintTerm, tolerance: float, *, spared: bool = 
     if term.equality:
         return min(tolerance, EQUALITY_TOLERANCE)
     return 0.0 if spared else tolerance
-
-
-class PlainTerm:
-    """A cost or constraint term in plain Python, at points z = (x, u): for checks of derivatives, and of runs."""
-
-    def __init__(self, term: CostTerm | ConstraintTerm, states: int, controls: int) -> None:
-        self.shared = term.shared if isinstance(term, ConstraintTerm) else 0
-        self.states, self.size = states, states + controls
-        named = term.functions[0].parameters if term.functions else ()
-        parameters = dict(zip(named, term.data.tolist(), strict=False))
-        wanted = [name for name in ("derivatives", "value", "slope", "shared_jacobian") if term.code.has(name)]
-        sizes, calls = {"N": states, "M": controls}, [function.plain_call(parameters) for function in term.functions]
-        self._functions = plain_functions(term.code, sizes, wanted, calls)
-        places = [address_of(function) if function.is_memory else float(i) for i, function in enumerate(term.functions)]
-        self._data = np.concatenate([places, term.data])
-
-    def cost(self, z: Array) -> tuple[float, Array, Array]:
-        """The cost, its gradient (n+m,) and its Hessian (n+m, n+m), before any projection."""
-        x, u = z[: self.states], z[self.states :]
-        gradient, hessian = np.zeros(self.size), np.zeros((self.size, self.size))
-        return float(self._functions["derivatives"](x, u, 1, self._data, hessian, gradient)), gradient, hessian
-
-    def value(self, z: Array, row: int, knot: int = 1) -> float:
-        """One row of the constraint at a knot."""
-        return float(self._functions["value"](*self._point(z), knot, row, self._data))
-
-    def slope(self, z: Array, row: int) -> Array:
-        """The gradient (n+m,) of one row of the constraint."""
-        gradient = np.zeros(self.size)
-        self._functions["slope"](*self._point(z), 1, row, self._data, gradient)
-        return gradient
-
-    def _point(self, z: Array) -> tuple[Array, Array]:
-        """State and control; or, in their place, the values that all rows share and their derivatives."""
-        x, u = z[: self.states], z[self.states :]
-        if not self.shared:
-            return x, u
-        at, moves = np.zeros(self.shared), np.zeros((self.shared, self.states))
-        self._functions["shared_jacobian"](x, self._data, at, moves)
-        return at, moves
-
-
-def violated(
-    term: ConstraintTerm, states: Array, controls: Array, counts: npt.NDArray[np.bool_], tolerance: float
-) -> Iterator[tuple[Array, npt.NDArray[np.intp]]]:
-    """The largest violation (K,) of each run and its knot (K,), zeros for a run without one, row by row.
-
-    Args:
-      states: (K, T+1, n). controls: (K, T, m). counts: (K, T+1), whether a knot counts.
-    """
-    steps, (n, m) = controls.shape[1], (states.shape[2], controls.shape[2])
-    plain = PlainTerm(term, n, m)
-    knots = range(steps) if term.uses_control else range(steps if term.final_only else 1, steps + 1)
-    for row in range(term.rows):
-        largest, when = np.zeros(len(states)), np.zeros(len(states), dtype=np.intp)
-        for k, knot in zip(*np.nonzero(counts[:, knots.start : knots.stop]), strict=True):
-            t = int(knot) + knots.start
-            value = plain.value(np.concatenate([states[k, t], controls[k, min(t, steps - 1)]]), row, t)
-            missed = abs(value) if term.equality else -value
-            if missed > max(tolerance, largest[k]):
-                largest[k], when[k] = missed, t
-        yield largest, when
-
-
-def by_name(
-    who: str, values: object, named: Mapping[str, Any], each: str, check: Callable[[str, Any], _Value]
-) -> dict[str, _Value]:
-    """The values given for states by name, in a dictionary or by keyword."""
-    want = f"{each} by name of a state, as {who}(x=...) or {who}({{'x': ...}})"
-    check_kind(who, values, (Mapping, type(None)), want)
-    stated = dict(values or {})  # pyright: ignore[reportCallIssue, reportArgumentType]
-    check_items(who, tuple(stated), str, want)
-    for name in stated.keys() & named.keys():
-        raise InputError(f"{who}: got {excerpt(name)} twice, want each state once")
-    if not stated and not named:
-        raise InputError(f"{who}: got nothing, want {want}")
-    return {name: check(f"{who}: {excerpt(name)}", value) for name, value in {**stated, **named}.items()}
 
 
 # The kernels of residuals. The shared values are the residual, with whose data `data` begins. Of a constraint it has,

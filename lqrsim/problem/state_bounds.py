@@ -3,18 +3,29 @@
 import copy
 from collections.abc import Callable, Mapping, Sequence, Set
 from math import floor, inf
-from typing import Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.annotations import NonNegative, checked
 from lqrsim.codegen.sources import source_of
-from lqrsim.errors import Array, InputError, check_array, check_items, check_name, check_number, numbers_of
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_array,
+    check_items,
+    check_kind,
+    check_name,
+    check_number,
+    excerpt,
+    numbers_of,
+)
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.problem.parts import Constraint, ConstraintTerm, Cost, CostTerm, Side, by_name
+from lqrsim.problem.parts import Constraint, ConstraintTerm, Cost, CostTerm, Side
 
 Bounds = tuple[npt.ArrayLike, npt.ArrayLike]  # low and high, as given
+_Value = TypeVar("_Value")
 
 
 class GoalState(Constraint):
@@ -159,6 +170,21 @@ class LimitCost(Cost):
         kernels = source_of(__name__)
         soft = kernels.filled(value=(kernels, "soft"), derivatives=(kernels, "soft_derivatives"))
         return CostTerm(soft, numbers, exact_hessian=False)
+
+
+def by_name(
+    who: str, values: object, named: Mapping[str, Any], each: str, check: Callable[[str, Any], _Value]
+) -> dict[str, _Value]:
+    """The values given for states by name, in a dictionary or by keyword."""
+    want = f"{each} by name of a state, as {who}(x=...) or {who}({{'x': ...}})"
+    check_kind(who, values, (Mapping, type(None)), want)
+    stated = dict(values or {})  # pyright: ignore[reportCallIssue, reportArgumentType]
+    check_items(who, tuple(stated), str, want)
+    for name in stated.keys() & named.keys():
+        raise InputError(f"{who}: got {excerpt(name)} twice, want each state once")
+    if not stated and not named:
+        raise InputError(f"{who}: got nothing, want {want}")
+    return {name: check(f"{who}: {excerpt(name)}", value) for name, value in {**stated, **named}.items()}
 
 
 def _bound(field: str, bound: object) -> tuple[Side, Side]:
