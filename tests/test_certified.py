@@ -14,7 +14,7 @@ from whole_problems.claims import contradictions
 import lqrsim as ls
 from lqrsim.codegen import compiled_module
 from lqrsim.results.solution_parts import Certificate, Iteration, Status
-from lqrsim.solvers import budget, engine
+from lqrsim.solvers import budget, certify, engine
 from lqrsim.solvers.certify import faults
 
 GOOD = Certificate(
@@ -48,12 +48,13 @@ class TestCertificate:
     ) -> None:
         """A fault is injected between the method and its certificate: the policy is another one."""
         assert solver(drive).status is Status.CONVERGED
-        honest = engine.certificate_of
+        honest = certify.certificate_of
 
-        def spoilt(*arguments: Any, **named: Any) -> Certificate:
-            return dataclasses.replace(honest(*arguments, **named), policy_residual=1e-6)
+        def spoilt(*arguments: Any) -> tuple[Certificate, float]:
+            certificate, scale = honest(*arguments)
+            return dataclasses.replace(certificate, policy_residual=1e-6), scale
 
-        monkeypatch.setattr(engine, "certificate_of", spoilt)
+        monkeypatch.setattr(certify, "certificate_of", spoilt)
         solution = solver(drive)
         assert solution.status is Status.NOT_CERTIFIED
         assert not solution.success

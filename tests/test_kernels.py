@@ -92,8 +92,7 @@ from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers import compiled
 from lqrsim.solvers.between_knots import WithinPeriods
 from lqrsim.solvers.budget import Budget
-from lqrsim.solvers.certify import no_value
-from lqrsim.solvers.engine import SolveRun
+from lqrsim.solvers.engine import SolveRun, no_value
 from lqrsim.solvers.settings import SmootherSettings, resolve
 from lqrsim.solvers.stages import InteriorPoint, Measures, Stages
 

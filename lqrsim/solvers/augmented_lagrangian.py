@@ -21,6 +21,7 @@ from lqrsim.kernels.records import LOG, Motion
 from lqrsim.problem.parts import allowed_violation, violation_of, weighing_obstacles
 from lqrsim.problem.problem import Problem
 from lqrsim.results.solution_parts import Moments, Multipliers, Status
+from lqrsim.solvers.certify import certified
 from lqrsim.solvers.compiled import ConstraintMultipliers
 from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.settings import InitialGuess
@@ -41,7 +42,7 @@ def by_multipliers(run: SolveRun) -> RunResult:
     if run.initial_guess.multipliers and run.run_opening_pass():
         result = meet_constraints(run, None)
         if result.success or run.budget.over:
-            return run.certified(result)
+            return certified(run, result)
         # Multipliers of another problem do not help here.
         run = _again(run, run.problem, replace(run.initial_guess, multipliers=()))
     result = run.run_to_end()
@@ -53,7 +54,7 @@ def by_multipliers(run: SolveRun) -> RunResult:
         result = meet_constraints(run, result)
     else:
         run, result = _first_feasible(run, result)
-    return run.certified(result)
+    return certified(run, result)
 
 
 def _again(run: SolveRun, problem: Problem, initial_guess: InitialGuess) -> SolveRun:
@@ -183,7 +184,7 @@ def damped_to_end(run: SolveRun) -> RunResult:
     run.roll_out()
     optimality = run.linearize_about_plan() if np.isfinite(run.work.cost) else np.nan
     if not np.isfinite(optimality):
-        return run.certified(run.run_to_end())
+        return certified(run, run.run_to_end())
     if not run.problem.constraints:
         if not run.second_order:
             damped = run.damped()
@@ -191,12 +192,12 @@ def damped_to_end(run: SolveRun) -> RunResult:
             with run.budget.limited(REFINED):
                 damped = run.damped()
             if not run.budget.over:
-                return run.certified(run.newton(patient=True))
-        return run.certified(run.damped_result(damped, damped.status, damped.detail(run.problem.steps)))
+                return certified(run, run.newton(patient=True))
+        return certified(run, run.damped_result(damped, damped.status, damped.detail(run.problem.steps)))
     lagrangian = AugmentedLagrangian(run)
     lagrangian.evaluate(run.work.best)
     lagrangian.start()
-    return run.certified(_rounds(run, lagrangian, ""))
+    return certified(run, _rounds(run, lagrangian, ""))
 
 
 def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunResult:

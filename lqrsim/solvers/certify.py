@@ -1,7 +1,7 @@
 """Certificates: before a solver reports success, its plan is checked against the problem itself.
 
-`kernels/certificate.py` recomputes cost, dynamics, policy and optimality on a separate code path. This module compares
-them with the solver's claims; `SolveRun.certified` calls both.
+`kernels/certificate.py` recomputes cost, dynamics, policy and optimality on a separate code path. `certified` compares
+them with the solver's claims.
 
 Second-order optimality says whether a plan is a minimum, and gives a direction down from a saddle. The Hessian of the
 Lagrangian is reduced to the changes that keep the dynamics and all rows that are at zero. Its inertia is that of the
@@ -9,16 +9,22 @@ control blocks of a Riccati recursion, in which later controls respond at their 
 eigenvalue, its eigenvector and these responses are a direction of negative curvature.
 
 The recursion takes long, so compiled ones come first, which can only say that a plan is a minimum beyond doubt: without
-constraints that of `kernels/certificate.py` (`SolveRun.check_curvature`), else `Stages.least_curvatures`.
+constraints that of `kernels/certificate.py` (`curvature_of`), else `Stages.least_curvatures`.
 """
+
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
+from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.errors import Array
+from lqrsim.kernels import declarations
 from lqrsim.kernels.records import CERTIFICATE, CostToGo, Motion
-from lqrsim.problem.problem import FixedState, Problem
-from lqrsim.results.solution_parts import Certificate, Curvature
+from lqrsim.problem.problem import FixedState
+from lqrsim.results.solution_parts import Certificate, Curvature, Status
+from lqrsim.solvers.engine import RunResult, SolveRun, no_value
+from lqrsim.solvers.settings import has_curvature
 from lqrsim.solvers.stages import Stages
 
 # Tolerances for rounding: of the residuals of policy and dynamics, and of the cost, relative to it. A policy's control
@@ -47,35 +53,97 @@ SUSPECT = 1e-4  # curvature of a control block, relative to its terms, below whi
 Flags = npt.NDArray[np.bool_]
 
 
-def no_value(states: Array) -> CostToGo:
-    """A cost-to-go of zero along states (T+1, n): arguments where there is none."""
-    knots, n = states.shape
-    return CostToGo(np.zeros((knots, n, n)), np.zeros((knots, n)), np.zeros(knots))
+def certified(run: SolveRun, result: RunResult) -> RunResult:
+    """The result with its certificate; NOT_CERTIFIED if that contradicts a success."""
+    values = run.work.constraint_values(result.plan)
+    violation, value, wrong = run.work.violation(values), result.values.get("cost_to_go"), ""
+    to_go = no_value(result.states)
+    if value is not None:
+        to_go = CostToGo(*map(in_c_order, (value.hessian, value.gradient, np.asarray(value.constant))))
+    # Without a cost-to-go, the cost of noise is weighed by the policy's own.
+    weighed = value is None and run.problem.noise_term is not None
+    task = declarations.EVALUATE if weighed else declarations.CERTIFY
+    certificate, scale = certificate_of(run, task, result, to_go, violation)
+    if value is None:
+        certificate = replace(certificate, optimality=np.inf)
+    if result.success:
+        tolerance = run.final if result.status is Status.CONVERGED else None
+        if tolerance is not None and not certificate.optimality < SLACK * tolerance:
+            # If controls are at their limits, the Hessians of the Riccati pass are not the Hessians of the policy.
+            evaluated, _ = certificate_of(run, declarations.EVALUATE, result, no_value(result.states), violation)
+            certificate = replace(certificate, optimality=evaluated.optimality)
+        wrong = faults(
+            certificate, claimed=run.budget.log[-1].cost, rounding=CANCELLATION * scale,
+            tolerance=tolerance, kept=run.work.keeps(values),
+        )  # fmt: skip
+    if run.problem.noise_term is not None and run.problem.constraint_terms:
+        certificate = replace(certificate, cost=expected_cost(run, result))
+    cost = certificate.cost if np.isfinite(certificate.cost) else np.inf
+    result = replace(result, certificate=certificate, cost=cost, violation=violation)
+    curvature = Curvature.NOT_CHECKED if wrong else curvature_of(run, result)[0]
+    run.release_stages()
+    if not wrong:
+        return replace(result, certificate=replace(certificate, curvature=curvature))
+    if run.work.memory["damping"] > 0:  # Newton's method needed weights: the cost is flat or falls for ever
+        return replace(result, status=Status.NOT_POSITIVE_DEFINITE)
+    if result.status is Status.CONVERGED and not run.budget.left:  # where more iterations might have gone on
+        return replace(result, status=Status.MAX_ITERATIONS)
+    return replace(result, status=Status.NOT_CERTIFIED, detail=f"of the plan that converged: {wrong}")
 
 
 def certificate_of(
-    problem: Problem, row: np.void, states: Array, *, violation: float, least: float = 0.0
-) -> Certificate:
-    """Make the certificate of a plan with states (T+1, n) from the numbers that `kernels/certificate.py` wrote.
+    run: SolveRun, task: int, result: RunResult, to_go: CostToGo, violation: float
+) -> tuple[Certificate, float]:
+    """The certificate of a plan and its policy with a cost-to-go, and the size of the cost's terms.
 
-    The optimality is the predicted decrease of the cost relative to the cost, or to `least` if that is more: with a
-    free duration, the cost of time.
+    The optimality is the predicted decrease of the cost relative to the cost, or with a free duration, to the cost of
+    time if that is more.
     """
-    cost, scale, typical, motion, law, beyond, decrease, _ = (float(row[name]) for name in CERTIFICATE.names or ())
-    start = 0.0
-    if isinstance(problem.initial, FixedState):
-        start = float(np.abs(states[0] - problem.initial.numbers).max())
+    numbers, interior = np.zeros(1, CERTIFICATE), run.initial_guess.interior
+    numbers["typical"] = least = 0.0 if interior is None else interior.scale
+    run.check(task, result, to_go, numbers)
+    cost, scale, typical, motion, law, beyond, decrease, _ = numbers[0].item()
+    start, initial = 0.0, run.problem.initial
+    if isinstance(initial, FixedState):
+        start = float(np.abs(result.states[0] - initial.numbers).max())
     if not np.isfinite(cost):
         decrease = np.inf
     # Where typical changes are less than the rounding of the cost, as beside the cost of noise that no control damps,
     # the decrease is relative to them.
     size = typical if 0 < typical < CANCELLATION * abs(cost) else abs(cost)
     least = max(size, least, TYPICAL * typical, 1e-26 * scale, 1e-300)
-    optimality = decrease / least if np.isfinite(decrease) else np.inf
-    return Certificate(
+    certificate = Certificate(
         cost=cost, start=start, dynamics_residual=motion, policy_residual=law, limits=max(beyond, 0.0),
-        violation=violation, optimality=optimality,
+        violation=violation, optimality=decrease / least if np.isfinite(decrease) else np.inf,
     )  # fmt: skip
+    return certificate, scale
+
+
+def curvature_of(run: SolveRun, result: RunResult) -> tuple[Curvature, Motion | None]:
+    """The curvature of the Lagrangian at a result by exact second derivatives.
+
+    At a saddle also a direction of negative curvature, scaled to the typical sizes.
+    """
+    problem = run.problem
+    exact = run.second_order and has_curvature(problem) and problem.noise_term is None
+    if not (result.status is Status.CONVERGED and exact):
+        return Curvature.NOT_CHECKED, None
+    if not problem.constraints:
+        out = np.zeros(1, CERTIFICATE)
+        run.check(declarations.CURVE, result, no_value(result.states), out)
+        if out["curvature"][0] > FLAT:
+            return Curvature.MINIMUM, None
+    stages, plan = run.stages, Motion(*map(in_c_order, result.plan))
+    multipliers = stages.of_constraints([multipliers.values for multipliers in result.multipliers])
+    with np.errstate(all="ignore"):
+        return _Reduced(stages, plan, result.law.gain, multipliers).check()
+
+
+def expected_cost(run: SolveRun, result: RunResult) -> float:
+    """The cost under noise without penalties of constraints, which the cost-to-go of the solver has."""
+    out, none = np.zeros(1, CERTIFICATE), no_value(result.states)
+    run.check(declarations.EVALUATE, result, none, out, run.work.without_penalties())
+    return float(out[0]["cost"])
 
 
 def faults(
@@ -104,21 +172,12 @@ def faults(
     return ", ".join(contradictions)
 
 
-def curvature_at(stages: Stages, plan: Motion, gain: Array, multipliers: Array) -> tuple[Curvature, Motion | None]:
-    """The curvature of the Lagrangian at a stationary plan.
-
-    At a saddle also a direction of negative curvature, scaled to the typical sizes.
-
-    Args:
-      stages: whose models are overwritten. gain: (T, m, n) of a policy about the plan.
-      multipliers: (T+1, R) of the constraints' rows; those of limits are worked out here.
-    """
-    with np.errstate(all="ignore"):
-        return _Reduced(stages, plan, gain, multipliers).check()
-
-
 class _Reduced:
-    """The models about a plan, and which rows are held."""
+    """The models about a plan, which are overwritten, and which rows are held.
+
+    The gains (T, m, n) are those of a policy about the plan; multipliers (T+1, R) are those of the constraints' rows,
+    those of limits are worked out here.
+    """
 
     def __init__(self, stages: Stages, plan: Motion, gain: Array, multipliers: Array) -> None:
         # Between wide limits, the size of a control is no more than `USED` times what is used of it.

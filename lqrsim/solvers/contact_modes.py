@@ -34,7 +34,7 @@ from lqrsim.scenes.contacts import ContactModes, Period, Switches
 from lqrsim.scenes.mjcf_holding import least_distance
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Budget, Laps
-from lqrsim.solvers.certify import faults
+from lqrsim.solvers.certify import certified, faults
 from lqrsim.solvers.engine import RunResult, SolveRun
 
 MARGIN = 1e-9  # m, rad or m/s^2, distance that a plan keeps from a switch
@@ -420,7 +420,7 @@ def keep_modes(run: SolveRun, result: RunResult) -> RunResult | None:
         if descent is None or descent.plan is plan:
             return None
         detail = "no time was left for a certificate within its contact modes"
-        return run.certified(descent.result(Status.TIME_LIMIT, detail=detail))
+        return certified(run, descent.result(Status.TIME_LIMIT, detail=detail))
 
 
 def with_certificate(run: SolveRun, modes: ContactModes, descent: Descent, status: Status) -> RunResult:
@@ -428,7 +428,7 @@ def with_certificate(run: SolveRun, modes: ContactModes, descent: Descent, statu
     plan, (multipliers, limits) = descent.plan, descent.switch_multipliers()
     optimality, value = optimality_in_mode(run.problem, modes, plan, descent.model.gain, multipliers, limits)
     result = descent.result(Status.STALLED, values={"cost_to_go": value})
-    certificate = run.certified(result).certificate
+    certificate = certified(run, result).certificate
     assert certificate is not None
     contacts = surroundings(descent.model, plan, multipliers)
     certificate = replace(certificate, optimality=optimality, contacts=contacts)

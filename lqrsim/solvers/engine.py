@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import (
     Candidate,
     Certificate,
-    Curvature,
     Iteration,
     Moments,
     Multipliers,
@@ -32,7 +31,6 @@ from lqrsim.results.solution_parts import (
 )
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import ATTENTION, Budget
-from lqrsim.solvers.certify import CANCELLATION, FLAT, SLACK, certificate_of, curvature_at, faults, no_value
 from lqrsim.solvers.settings import INSIDE, InitialGuess, SmootherSettings, has_curvature
 from lqrsim.solvers.stages import Pool, Stages
 
@@ -133,6 +131,29 @@ class RunResult:
         missed = 0.0 if self.success else float(f"{self.violation:.2g}")
         return not self.success, self.status is not Status.INFEASIBLE, missed, self.cost
 
+    def is_worse(self, other: "RunResult", work: "Workspace") -> bool:
+        """Whether this plan violates constraints more than another, or costs more if both violate them as much."""
+        if not np.isfinite(other.cost):
+            return False
+        # The violations to two digits; 0 within the tolerances.
+        missed, others = (
+            0.0 if work.keeps(work.constraint_values(result.plan)) else float(f"{result.violation:.2g}")
+            for result in (self, other)
+        )
+        return missed > others or (missed == others and self.costs_more(other, work))
+
+    def costs_more(self, other: "RunResult", work: "Workspace") -> bool:
+        """Whether this plan costs more than another, by more than rounding.
+
+        What active constraints cost by ending inside, and the other plan saves by missing them within the tolerance, is
+        rounding, too: a given optimum may be on its bounds. Where both plans cost nothing but rounding, as a goal that
+        is met, only the size of what cancels says what that is.
+        """
+        rounding = ROUNDING * abs(other.cost) + MARGIN_SQUARES * float(work.memory["negligible"])
+        for multipliers, pressing in zip(work.multipliers, self.multipliers, strict=False):
+            rounding += float(np.abs(pressing.values).sum()) * (multipliers.margin + other.violation)
+        return not self.cost <= other.cost + rounding
+
     @property
     def success(self) -> bool:
         return self.status.success
@@ -140,6 +161,19 @@ class RunResult:
     def kept(self) -> "RunResult":
         """A copy that later iterations, which write to the same memory, do not change."""
         return replace(self, plan=deepcopy(self.plan), law=deepcopy(self.law), values=deepcopy(self.values))
+
+
+class LoopCall(NamedTuple):
+    """The arguments of the compiled loop, `smoother` of `kernels/iterations.py`."""
+
+    task: int
+    first: int
+    last: int
+    settings: records.IterationSettings
+    model: records.ProblemModel
+    arrays: records.SmootherArrays
+    memory: StructuredArray
+    log: StructuredArray
 
 
 class SolveRun:
@@ -177,7 +211,7 @@ class SolveRun:
 
     def give_back(self) -> None:
         """Let later runs have the memory."""
-        self._release_stages()
+        self.release_stages()
         _pool.give_back(self.work, self.problem)
 
     @property
@@ -193,7 +227,7 @@ class SolveRun:
                 self._stages = Stages.lent(self.problem)
         return self._stages
 
-    def _release_stages(self) -> None:
+    def release_stages(self) -> None:
         if self._stages is not None:
             self._stages.give_back()
             self._stages = None
@@ -428,81 +462,6 @@ class SolveRun:
             violation=self._violation_of(work.best), gap=gap, values=values,
         )  # fmt: skip
 
-    def certified(self, result: RunResult) -> RunResult:
-        """The result with its certificate; NOT_CERTIFIED if that contradicts a success."""
-        values = self.work.constraint_values(result.plan)
-        violation, value, wrong = self.work.violation(values), result.values.get("cost_to_go"), ""
-        to_go = no_value(result.states)
-        if value is not None:
-            to_go = CostToGo(*map(in_c_order, (value.hessian, value.gradient, np.asarray(value.constant))))
-        # Without a cost-to-go, the cost of noise is weighed by the policy's own.
-        weighed = value is None and self.problem.noise_term is not None
-        task = declarations.EVALUATE if weighed else declarations.CERTIFY
-        certificate, scale = self._checked(task, result, to_go, violation)
-        if value is None:
-            certificate = replace(certificate, optimality=np.inf)
-        if result.success:
-            tolerance = self.final if result.status is Status.CONVERGED else None
-            if tolerance is not None and not certificate.optimality < SLACK * tolerance:
-                # If controls are at their limits, the Hessians of the Riccati pass are not the Hessians of the policy.
-                evaluated, _ = self._checked(declarations.EVALUATE, result, no_value(result.states), violation)
-                certificate = replace(certificate, optimality=evaluated.optimality)
-            wrong = faults(
-                certificate, claimed=self.budget.log[-1].cost, rounding=CANCELLATION * scale,
-                tolerance=tolerance, kept=self.work.keeps(values),
-            )  # fmt: skip
-        if self.problem.noise_term is not None and self.problem.constraint_terms:
-            certificate = replace(certificate, cost=self.expected_cost(result))
-        cost = certificate.cost if np.isfinite(certificate.cost) else np.inf
-        result = replace(result, certificate=certificate, cost=cost, violation=violation)
-        curvature = Curvature.NOT_CHECKED if wrong else self.check_curvature(result)[0]
-        self._release_stages()
-        if not wrong:
-            return replace(result, certificate=replace(certificate, curvature=curvature))
-        if self.work.memory["damping"] > 0:  # Newton's method needed weights: the cost is flat or falls for ever
-            return replace(result, status=Status.NOT_POSITIVE_DEFINITE)
-        if result.status is Status.CONVERGED and not self.budget.left:  # where more iterations might have gone on
-            return replace(result, status=Status.MAX_ITERATIONS)
-        return replace(result, status=Status.NOT_CERTIFIED, detail=f"of the plan that converged: {wrong}")
-
-    def _checked(self, task: int, result: RunResult, to_go: CostToGo, violation: float) -> tuple[Certificate, float]:
-        """The certificate of a plan and its policy with a cost-to-go, and the size of the cost's terms."""
-        numbers, interior = np.zeros(1, CERTIFICATE), self.initial_guess.interior
-        numbers["typical"] = least = 0.0 if interior is None else interior.scale
-        self._loop(*self._check_arguments(task, result, to_go, numbers))
-        certificate = certificate_of(self.problem, numbers[0], result.states, violation=violation, least=least)
-        return certificate, float(numbers["scale"][0])
-
-    def check_curvature(self, result: RunResult) -> tuple[Curvature, Motion | None]:
-        """The curvature at a result by exact second derivatives, with a direction of negative curvature at a saddle."""
-        problem = self.problem
-        exact = self.second_order and has_curvature(problem) and problem.noise_term is None
-        if not (result.status is Status.CONVERGED and exact):
-            return Curvature.NOT_CHECKED, None
-        if not problem.constraints:
-            out = np.zeros(1, CERTIFICATE)
-            self._loop(*self._check_arguments(declarations.CURVE, result, no_value(result.states), out))
-            if out["curvature"][0] > FLAT:
-                return Curvature.MINIMUM, None
-        stages, plan = self.stages, Motion(*map(in_c_order, result.plan))
-        multipliers = stages.of_constraints([multipliers.values for multipliers in result.multipliers])
-        return curvature_at(stages, plan, result.law.gain, multipliers)
-
-    def _without_penalties(self) -> records.ProblemModel:
-        """The model without constraints, whose noise is weighed by its own cost-to-go."""
-        model = self.work.model
-        stage, final = (
-            cost._replace(constraints=cost.constraints._replace(size=0)) for cost in (model.stage, model.final)
-        )
-        return model._replace(stage=stage, final=final, noise=model.noise._replace(risk=model.noise.risk * (1, 1, 0)))
-
-    def expected_cost(self, result: RunResult) -> float:
-        """The cost under noise without penalties of constraints, which the cost-to-go of the solver has."""
-        out, none = np.zeros(1, CERTIFICATE), no_value(result.states)
-        task, first, last, options, _, *others = self._check_arguments(declarations.EVALUATE, result, none, out)
-        self._loop(task, first, last, options, self._without_penalties(), *others)
-        return float(out[0]["cost"])
-
     def weigh_noise(self, plan: Motion) -> None:
         """From now on, weigh noise whose cost depends on the plan by the cost-to-go about this plan without penalties.
 
@@ -514,48 +473,16 @@ class SolveRun:
         if term is None or not (term.active or self.problem.risk):
             return
         rows, memory, to_go = np.full(1, np.nan, LOG), self.work.memory_rows.copy(), no_value(plan.states)
-        task, first, last, options, _, *_ = self._linearize_arguments(rows)
         apart = arrays._replace(
             best=plan, last=self.work.trial, to_go=to_go, prior=self.work.no_prior, x_hat=arrays.x_hat.copy(),
             x_hats=arrays.x_hats.copy(), policy=deepcopy(arrays.policy),
             to_come=deepcopy(arrays.to_come), smoothing=deepcopy(arrays.smoothing),
         )  # fmt: skip
-        *_, failed = self._loop(task, first, last, options, self._without_penalties(), apart, memory, rows)
+        about = self._linearize_arguments(rows)
+        *_, failed = self._loop(*about._replace(model=self.work.without_penalties(), arrays=apart, memory=memory))
         if failed < 0:
             noise = self.work.model.noise
             noise.hessian[...], noise.gradient[...], noise.risk[2] = to_go.hessian, to_go.gradient, 1.0
-
-    def given(self) -> RunResult:
-        """The rollout of the initial policy, certified, as a plan that the answer must not be worse than."""
-        self.roll_out()
-        work, law = self.work, self.work.arrays.last_policy
-        result = RunResult(status=Status.STALLED, plan=work.last, law=law, cost=work.cost).kept()
-        return self.certified(result) if np.isfinite(result.states).all() else result
-
-    def is_worse(self, plan: RunResult, other: RunResult) -> bool:
-        """Whether a plan violates constraints more than another, or costs more if both violate them as much."""
-        if not np.isfinite(other.cost):
-            return False
-        missed, others = (self._missed(result) for result in (plan, other))
-        return missed > others or (missed == others and self.costs_more(plan, other))
-
-    def _missed(self, result: RunResult) -> float:
-        """The violation of a plan to two digits; 0 within the tolerances."""
-        if not self.problem.constraints or self.work.keeps(self.work.constraint_values(result.plan)):
-            return 0.0
-        return float(f"{result.violation:.2g}")
-
-    def costs_more(self, result: RunResult, other: RunResult) -> bool:
-        """Whether a plan costs more than another, by more than rounding.
-
-        What active constraints cost by ending inside, and the other plan saves by missing them within the tolerance, is
-        rounding, too: a given optimum may be on its bounds. Where both plans cost nothing but rounding, as a goal that
-        is met, only the size of what cancels says what that is.
-        """
-        rounding = ROUNDING * abs(other.cost) + MARGIN_SQUARES * float(self.work.memory["negligible"])
-        for multipliers, pressing in zip(self.work.multipliers, result.multipliers, strict=False):
-            rounding += float(np.abs(pressing.values).sum()) * (multipliers.margin + other.violation)
-        return not result.cost <= other.cost + rounding
 
     def candidate(self, name: str, result: RunResult | None) -> Candidate:
         """This run as a candidate of a search; `result` is its result if it was run to its end."""
@@ -566,8 +493,16 @@ class SolveRun:
 
     # The compiled loop, and its arguments.
 
+    def check(
+        self, task: int, result: RunResult, to_go: CostToGo, certificate: StructuredArray,
+        model: records.ProblemModel | None = None,
+    ) -> None:  # fmt: skip
+        """Check a plan and its policy with a cost-to-go, by `kernels/certificate.py`; by default of the run's model."""
+        call = self._check_arguments(task, result, to_go, certificate)
+        self._loop(*call._replace(model=model or call.model))
+
     def _iterate(
-        self, arguments: Callable[[int, int, StructuredArray], tuple[Any, ...]], plan: Motion,
+        self, arguments: Callable[[int, int, StructuredArray], LoopCall], plan: Motion,
         rows: StructuredArray | None = None, first: int = 0, last: int | None = None,
     ) -> Ending:  # fmt: skip
         """Run the loop with these arguments until it ends, has written `last` rows, or the budget is over.
@@ -612,7 +547,7 @@ class SolveRun:
                 outcome = declarations.TIMED_OUT
         return Ending(outcome, len(budget.log), failed, backward, raised_by(functions))
 
-    def _arguments(self, first: int, last: int, rows: StructuredArray, *, again: bool = False) -> tuple[Any, ...]:
+    def _arguments(self, first: int, last: int, rows: StructuredArray, *, again: bool = False) -> LoopCall:
         """Arguments of the loop for iterations from `first` up to `last`; one at a time during a homotopy."""
         work, tolerance, valley = self.work, self.rough, 0.0 if again else self._valley
         fraction = 1.0 if again else self._fractions[min(first, len(self._fractions) - 1)]
@@ -630,17 +565,15 @@ class SolveRun:
     def _plan_arguments(
         self, task: int, how: Descent, tolerance: float, gap_tolerance: float, first: int, last: int,
         rows: StructuredArray,
-    ) -> tuple[Any, ...]:  # fmt: skip
+    ) -> LoopCall:  # fmt: skip
         """Arguments for steps from the plan, with this tolerance of the cost and at least that of the gap."""
         options = {"descent": how, "gap_tolerance": max(self.settings.gap_tolerance, gap_tolerance)}
         return self._stated(task, first, last, rows, tolerance, options, prior=self.work.no_prior, last=self.work.trial)
 
-    def _linearize_arguments(self, rows: StructuredArray) -> tuple[Any, ...]:
+    def _linearize_arguments(self, rows: StructuredArray) -> LoopCall:
         return self._plan_arguments(declarations.LINEARIZE, DAMPED_STEPS, self.rough, 0.0, 0, 0, rows)
 
-    def _check_arguments(
-        self, task: int, result: RunResult, to_go: CostToGo, certificate: StructuredArray
-    ) -> tuple[Any, ...]:
+    def _check_arguments(self, task: int, result: RunResult, to_go: CostToGo, certificate: StructuredArray) -> LoopCall:
         """Arguments for certifying a plan and its policy with this cost-to-go."""
         return self._stated(
             task, 0, 0, self._rows, self.final, {}, to_go=to_go, last=result.plan, last_policy=result.law,
@@ -650,7 +583,7 @@ class SolveRun:
     def _stated(
         self, task: int, begin: int, end: int, rows: StructuredArray, tolerance: float, options: dict[str, Any],
         **arrays: Any,
-    ) -> tuple[Any, ...]:  # fmt: skip
+    ) -> LoopCall:  # fmt: skip
         """Arguments for at most one iteration per row, with other options than the run's, and other arrays."""
         work, settings = self.work, records.IterationSettings(
             steps=self.problem.steps, max_iterations=len(rows), tolerance=float(tolerance),
@@ -658,7 +591,7 @@ class SolveRun:
             rounding=self.problem.dynamics.rounding**2,
         )  # fmt: skip
         arrays_ = work.arrays._replace(**arrays)
-        return task, begin, end, settings._replace(**options), work.model, arrays_, work.memory_rows, rows
+        return LoopCall(task, begin, end, settings._replace(**options), work.model, arrays_, work.memory_rows, rows)
 
     def _violation_of(self, plan: Motion) -> float:
         return self.work.violation(self.work.constraint_values(plan)) if self.problem.constraints else 0.0
@@ -766,6 +699,14 @@ class Workspace:
                 law = gain, inverse[1] - np.einsum("tij,tj->ti", gain, mean[1:])
         return {"cost_to_go": to_go, "cost_to_come": Moments(*to_come), "inverse_law": law}
 
+    def without_penalties(self) -> records.ProblemModel:
+        """The model without constraints, whose noise is weighed by its own cost-to-go."""
+        model = self.model
+        stage, final = (
+            cost._replace(constraints=cost.constraints._replace(size=0)) for cost in (model.stage, model.final)
+        )
+        return model._replace(stage=stage, final=final, noise=model.noise._replace(risk=model.noise.risk * (1, 1, 0)))
+
     def homotopy_scaled(self, fraction: float) -> records.CostModel:
         """The stage cost with its homotopy-scaled terms at that fraction; see `CostTerm.factor`."""
         if fraction == 1:
@@ -812,6 +753,12 @@ class Workspace:
 def copied(plan: RunResult | Trajectory | Motion) -> Motion:
     """A copy of the states and controls of a plan."""
     return Motion(plan.states.copy(), plan.controls.copy())
+
+
+def no_value(states: Array) -> CostToGo:
+    """A cost-to-go of zero along states (T+1, n): arguments where there is none."""
+    knots, n = states.shape
+    return CostToGo(np.zeros((knots, n, n)), np.zeros((knots, n)), np.zeros(knots))
 
 
 _pool = Pool[Workspace]()

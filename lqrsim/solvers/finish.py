@@ -27,6 +27,7 @@ from lqrsim.results.solution_parts import Multipliers, Status, Trajectory
 from lqrsim.solvers import compiled
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian, by_multipliers, damped_to_end, meet_constraints
 from lqrsim.solvers.budget import Laps
+from lqrsim.solvers.certify import certified
 from lqrsim.solvers.engine import RunResult, SolveRun, copied
 from lqrsim.solvers.settings import has_curvature
 from lqrsim.solvers.stages import NAME, STRONG, WEAK, Barrier, InteriorPoint, InteriorResult, Measures, Sizes, restore
@@ -81,7 +82,7 @@ def finish(run: SolveRun, known: Known) -> RunResult:
     if run.initial_guess.interior is not None or (run.problem.constraints and run.second_order):
         return ConstrainedRun(run, known).run_to_end()
     if not run.problem.constraints:
-        return run.certified(_without_constraints(run))
+        return certified(run, _without_constraints(run))
     result = by_multipliers(run)
     # It begins with the optimum without the constraints, which is often the same from all starts, so they count as one.
     if result.stuck and not known.evidence:
@@ -106,7 +107,7 @@ def from_states(run: SolveRun, known: Known) -> RunResult:
     assert run.initial_guess.trajectory is not None
     point = InteriorRun(run)
     result = point.run_from(copied(run.initial_guess.trajectory), STRONG)
-    return run.certified(point.start() if result is None else result)
+    return certified(run, point.start() if result is None else result)
 
 
 def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult | None:
@@ -116,14 +117,14 @@ def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult
         for barrier in WEAK, STRONG:
             result = point.run_from(copied(plan), barrier)
             if result is not None and result.success:
-                return run.certified(result)
+                return certified(run, result)
         return None
     law = compiled.law_about(plan.states, plan.controls, saddle.law.gain)
     beside = point.result(compiled.rollout(run.problem, *law, plan.states[0].copy()))
     if not beside.cost < saddle.cost:
         return None
     run.work.set_best(beside.plan, beside.cost)
-    return run.certified(run.newton(patient=True))
+    return certified(run, run.newton(patient=True))
 
 
 def _without_constraints(run: SolveRun) -> RunResult:
@@ -481,7 +482,7 @@ class ConstrainedRun(InteriorRun):
         with self._budget.limited(AUGMENTED):
             result = meet_constraints(run, run.result(run.ending), stale=STALE)
         if result.success and not self._curved:
-            return run.certified(result)
+            return certified(run, result)
         return self._after_multipliers(result, most=self._start.cost)
 
     def _after_multipliers(self, result: RunResult, *, most: float = np.inf) -> RunResult | None:
@@ -547,7 +548,7 @@ class ConstrainedRun(InteriorRun):
 
     def _worse(self, result: RunResult) -> bool:
         """Whether a plan costs more than the given one, which keeps the constraints, by more than rounding."""
-        return self._given is not None and self._run.costs_more(result, self._given)
+        return self._given is not None and result.costs_more(self._given, self._run.work)
 
     def _answer(self) -> RunResult:
         """The best result, certified."""
@@ -570,7 +571,7 @@ class ConstrainedRun(InteriorRun):
                 best = replace(best, against=tuple(others))
                 detail += f"; against it stand {', '.join(others)}" if others else ""
             best = replace(best, status=Status.TIME_LIMIT if stop.due else status, detail=detail)
-        return best if best.certificate is not None else run.certified(best)
+        return best if best.certificate is not None else certified(run, best)
 
 
 def _alike(cases: Sequence[RunResult]) -> list[RunResult]:

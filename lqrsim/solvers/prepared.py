@@ -21,6 +21,7 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import clearance_of, goal_radius_of
 from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian, meet_constraints
 from lqrsim.solvers.budget import Budget, Laps, Stop, check_threads
+from lqrsim.solvers.certify import expected_cost
 from lqrsim.solvers.control_rates import feedback, narrowed, widened, with_commands
 from lqrsim.solvers.engine import ROUNDING, RunResult, SolveRun, copied
 from lqrsim.solvers.finish import Known, finish
@@ -271,7 +272,7 @@ def _cost_of(run: SolveRun, cost: float, plan: Motion, law: Policy) -> float:
     """The cost of a plan in a run: under noise with constraints without their penalties, which `cost` has there."""
     if run.problem.noise_term is None or not run.problem.constraints or not np.isfinite(cost):
         return cost
-    return run.expected_cost(RunResult(status=Status.STALLED, plan=plan, law=law))
+    return expected_cost(run, RunResult(status=Status.STALLED, plan=plan, law=law))
 
 
 class _Finder:

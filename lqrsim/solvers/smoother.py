@@ -30,6 +30,7 @@ from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import assemble
 from lqrsim.solvers.between_knots import between_knots, solve_between_knots
 from lqrsim.solvers.budget import Budget, Callback, Stop, check_threads, reported, workers
+from lqrsim.solvers.certify import certified
 from lqrsim.solvers.control_rates import solve_with_rates
 from lqrsim.solvers.engine import RunResult, SolveRun, copied
 from lqrsim.solvers.free_duration import solve_for_duration
@@ -328,7 +329,7 @@ def _solve_ilqr(problem: Problem, settings: Settings, stop: Stop | None = None) 
         violation=0.0, gap=0.0,
         values={"cost_to_go": Quadratic(*work.arrays.to_go)} if complete else {},
     )  # fmt: skip
-    result = run.certified(result)
+    result = certified(run, result)
     solution = assemble(run, result, solver="ilqr", options=settings.options(guess))
     run.give_back()
     return stop.finish(solution)

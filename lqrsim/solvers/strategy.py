@@ -29,6 +29,7 @@ from lqrsim.results.solution_parts import Candidate, Curvature, Status, Trajecto
 from lqrsim.solvers import compiled, multistart
 from lqrsim.solvers.assembly import assemble, clearance_of
 from lqrsim.solvers.budget import Budget, Stop
+from lqrsim.solvers.certify import certified, curvature_of
 from lqrsim.solvers.engine import RunResult, SolveRun, copied
 from lqrsim.solvers.finish import Known, finish, from_beside, from_states, refine
 from lqrsim.solvers.multistart import SWAYS, choose, guides, passable, sinusoidal_controls, sinusoidal_name
@@ -111,7 +112,7 @@ class Search:
         begun = [run for _, run in self._named]
         guess = begun[0].initial_guess
         is_plan = self._settings.start is not None and guess.prior is None and guess.interior is None
-        given = begun[0].given() if is_plan else None
+        given = _given(begun[0]) if is_plan else None
         with self._stop.reporting("smooth"):
             # The attempts after this block also solve problems with other dynamics, and set the threads for each.
             with self._problem.dynamics.solving(self._solving):
@@ -355,7 +356,7 @@ class Search:
 
     def _descend(self, run: SolveRun, at_saddle: RunResult) -> bool:
         """Leave a saddle; return whether a plan was found that costs less."""
-        _, direction = run.check_curvature(at_saddle)
+        _, direction = curvature_of(run, at_saddle)
         if direction is None:
             return False
         saddle = at_saddle.kept()
@@ -407,8 +408,8 @@ class Search:
         for _, _, name, begin in plans[:PUSHES]:
             run = self._add(begin, name)
             with problem.dynamics.solving(self._threads):
-                begun, other = run.given(), self._finish(run, refine)
-            if run.is_worse(other, begun):  # a plan that no step can begin from is left by smoothing
+                begun, other = _given(run), self._finish(run, refine)
+            if other.is_worse(begun, run.work):  # a plan that no step can begin from is left by smoothing
                 status = Status.TIME_LIMIT if self._stop.due else Status.STALLED
                 other = replace(begun, status=status, detail="no step lowers the cost of this plan")
             self._offer(run, other, better=before.violation >= other.violation and other.cost < self.best[1].cost)
@@ -461,14 +462,14 @@ class Search:
         """If the best plan is worse than the caller's, or has left what that moved, descend from the caller's plan."""
         run, best = self.best
         still = _differ(best, given, self._unmoved())
-        worsened = still or run.is_worse(best, given) or _goal_left(self._problem, best, given)
+        worsened = still or best.is_worse(given, run.work) or _goal_left(self._problem, best, given)
         if worsened and not self._stop.due:
             run = self._add(guess_from(given, "descent from the given plan"))
             other = self._finish(run, refine)
-            wanted = run.is_worse(best, given) or (still and other.cost < best.cost) or other.rank < best.rank
-            self._offer(run, other, better=wanted and not run.is_worse(other, given))
+            wanted = best.is_worse(given, run.work) or (still and other.cost < best.cost) or other.rank < best.rank
+            self._offer(run, other, better=wanted and not other.is_worse(given, run.work))
         run, best = self.best
-        if run.is_worse(best, given):
+        if best.is_worse(given, run.work):
             status = Status.TIME_LIMIT if self._stop.due else Status.STALLED
             detail = "no plan was found that is better than the given one, which is returned"
             self._offer(run, replace(given, status=status, detail=detail), better=True)
@@ -778,6 +779,14 @@ class Search:
     def is_without_plan(self) -> bool:
         """Whether no plan so far keeps the constraints, if there are any."""
         return bool(self._problem.constraints) and not self.best[1].success
+
+
+def _given(run: SolveRun) -> RunResult:
+    """The rollout of the initial policy, certified, as a plan that the answer must not be worse than."""
+    run.roll_out()
+    work, law = run.work, run.work.arrays.last_policy
+    result = RunResult(status=Status.STALLED, plan=work.last, law=law, cost=work.cost).kept()
+    return certified(run, result) if np.isfinite(result.states).all() else result
 
 
 def left_domain(problem: Problem, result: RunResult) -> str:
