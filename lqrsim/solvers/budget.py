@@ -4,17 +4,18 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
 from lqrsim.annotations import Want
 from lqrsim.codegen.compiled_module import compilations
-from lqrsim.codegen.user_functions import UserFunction
+from lqrsim.codegen.user_functions import UserFunction, interrupt_of
 from lqrsim.errors import check_count
+from lqrsim.kernels.records import StructuredArray
 from lqrsim.machine import processors
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Iteration, Status
@@ -221,6 +222,32 @@ class Laps:
         now, improvement = time.perf_counter(), (self._cost - cost) / max(abs(cost), 1e-300)
         seconds, self._cost, self.ended = now - self.ended if seconds is None else seconds, cost, now
         self._budget.record(Iteration(cost, improvement, gap, optimality, gap, violation, seconds, method))
+
+
+def in_slices(
+    run: Callable[[int, int], Sequence[int]], log: StructuredArray, watch: Callable[[tuple[Any, ...], float], bool],
+    functions: Sequence[UserFunction], attention: float, *, first: int = 0,
+) -> Iterator[tuple[Sequence[int], bool]]:  # fmt: skip
+    """Run compiled iterations from `first` on, as long as the log has room for their rows.
+
+    A slice is some of `attention` seconds: 0 for one iteration, as if plain Python functions are to be heard, infinity
+    for all. It is `run(begin, end)`, whose result, beginning with the number of iterations, is yielded, with whether it
+    is over: `watch` was true for one of its rows and the seconds of an iteration.
+    """
+    last, over = len(log), False
+    attention, size = (np.inf, last) if attention == np.inf else (0.0 if functions else attention, 1)
+    while not over and first < last:
+        begin, clock = first, time.perf_counter()
+        ended = run(begin, min(begin + size, last))
+        first = ended[0]
+        seconds = (time.perf_counter() - clock) / max(first - begin, 1)
+        for row in log[begin:first].tolist():
+            over = watch(row, seconds) or over
+        if error := interrupt_of(functions):
+            raise error
+        if attention < np.inf:
+            size = max(1, int(attention / max(seconds, 1e-9)))
+        yield ended, over
 
 
 class _Watch:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lqrsim.codegen.compiled_module import Call, CompiledModule, in_c_order
-from lqrsim.codegen.user_functions import interrupt_of, raised_by
+from lqrsim.codegen.user_functions import raised_by
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels import declarations, records
 from lqrsim.kernels.iterations import DAMPED_STEPS, NEWTON_STEPS
@@ -30,7 +30,7 @@ from lqrsim.results.solution_parts import (
     Trajectory,
 )
 from lqrsim.solvers import compiled
-from lqrsim.solvers.budget import ATTENTION, Budget
+from lqrsim.solvers.budget import ATTENTION, Budget, in_slices
 from lqrsim.solvers.settings import INSIDE, InitialGuess, SmootherSettings, has_curvature
 from lqrsim.solvers.stages import Pool, Stages
 
@@ -164,7 +164,7 @@ class RunResult:
 
 
 class LoopCall(NamedTuple):
-    """The arguments of the compiled loop, `smoother` of `kernels/iterations.py`."""
+    """The arguments of the compiled loop; see `kernels/iterations.py`."""
 
     task: int
     first: int
@@ -512,40 +512,42 @@ class SolveRun:
         iterations between two returns. An iteration writes `plan`; rows are written from `first` on, by default as many
         as are left.
         """
-        problem, budget, stop = self.problem, self.budget, self.budget.stop
+        budget, stop, functions = self.budget, self.budget.stop, functions_of(self.problem)
         rows = np.zeros(max(budget.left, 1), LOG) if rows is None else rows
-        functions = functions_of(problem)
-        heard = budget.stop.attentive and (budget.watched or bool(functions))
-        single = heard or bool(problem.constraints) or stop.deadline < np.inf
-        last = min(budget.left if last is None else last, first + budget.left)
-        size = 1 if budget.stop.attentive or single else last
+        last, missed = min(budget.left if last is None else last, first + budget.left), 0.0
+        single = self.problem.constraints or stop.deadline < np.inf or (stop.attentive and budget.watched)
+        attention = 0.0 if single else ATTENTION if stop.attentive else np.inf
         for function in functions:
             function.forget()
-        outcome, backward, failed, done = declarations.RUNNING, False, -1, first
-        while outcome == declarations.RUNNING and done < last:
-            if stop.due:
-                outcome = declarations.TIMED_OUT
-                break
-            clock, begin = time.perf_counter(), done
-            try:
-                done, outcome, backward, failed = self._loop(*arguments(begin, min(begin + size, last), rows))
-                stop.error = interrupt_of(functions) or stop.error
-                missed = self._violation_of(plan) if done > begin else 0.0
-            except BaseException as error:  # Ctrl-C: raised again when there is a solution
-                stop.error, outcome = error, declarations.TIMED_OUT
-                break
-            seconds = (time.perf_counter() - clock) / max(done - begin, 1)
-            if budget.stop.attentive and not single:
-                size = max(1, int(ATTENTION / max(seconds, 1e-9)))
-            for i, row in enumerate(rows[begin:done].tolist(), begin + 1):
-                cost, improvement, gap, optimality, residual, method = row
-                violation = missed if i == done or not problem.constraints else float("nan")
-                name = _METHODS[int(method)]
-                budget.record(Iteration(cost, improvement, gap, optimality, residual, violation, seconds, name))
-            stop.pace = time.perf_counter() - clock
-            if stop.error is not None:
-                outcome = declarations.TIMED_OUT
-        return Ending(outcome, len(budget.log), failed, backward, raised_by(functions))
+        if first < last and stop.due:
+            return Ending(declarations.TIMED_OUT, len(budget.log))
+
+        def run(begin: int, end: int) -> Sequence[int]:
+            nonlocal missed
+            ended = self._loop(*arguments(begin, end, rows))
+            if ended[0] > begin:
+                missed = self._violation_of(plan)
+            return ended
+
+        def watch(row: tuple[Any, ...], seconds: float) -> bool:
+            *numbers, method = row
+            budget.record(Iteration(*numbers, missed, seconds, _METHODS[int(method)]))
+            return stop.error is not None
+
+        ending, clock = Ending(declarations.RUNNING), time.perf_counter()
+        slices = in_slices(run, rows[:last], watch, functions, attention, first=first)
+        try:
+            for (done, outcome, backward, failed), over in slices:
+                now = time.perf_counter()
+                stop.pace, clock = now - clock, now
+                if over or (outcome == declarations.RUNNING and done < last and stop.due):
+                    outcome = declarations.TIMED_OUT
+                ending = Ending(outcome, failed=failed, backward=backward)
+                if outcome != declarations.RUNNING:
+                    break
+        except BaseException as error:  # Ctrl-C: raised again when there is a solution
+            stop.error, ending = error, Ending(declarations.TIMED_OUT)
+        return replace(ending, done=len(budget.log), raised=raised_by(functions))
 
     def _arguments(self, first: int, last: int, rows: StructuredArray, *, again: bool = False) -> LoopCall:
         """Arguments of the loop for iterations from `first` up to `last`; one at a time during a homotopy."""

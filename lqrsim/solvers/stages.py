@@ -9,7 +9,7 @@ slices between which their caller is told, an active set in pieces short enough 
 import functools
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -17,7 +17,6 @@ import numpy as np
 
 from lqrsim.codegen.compiled_module import Call, CompiledModule, in_c_order, module_of
 from lqrsim.codegen.sources import source_of
-from lqrsim.codegen.user_functions import interrupt_of
 from lqrsim.errors import Array
 from lqrsim.kernels import active_set, interior_point, records, restoration
 from lqrsim.kernels.declarations import CONVERGED, NO_PROGRESS, NOT_FINITE, RUNNING
@@ -28,7 +27,7 @@ from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import Multipliers, Trajectory
 from lqrsim.solvers import compiled
-from lqrsim.solvers.budget import ATTENTION, Laps
+from lqrsim.solvers.budget import ATTENTION, Laps, in_slices
 from lqrsim.solvers.settings import INSIDE
 
 MOST_KEPT, LARGEST_KEPT = 16, 8 * 1024 * 1024  # memories that are kept for later solves, and largest size in bytes
@@ -402,11 +401,12 @@ class InteriorPoint:
             watch(Measures.of(self._memory), time.perf_counter() - clock)
             return self._result(True)
         outcome = RUNNING
-        slices = _in_slices(
-            self._stages.problem, self._log, lambda _, last: self._call(ITERATE, last),
-            lambda row, seconds: watch(Measures(*row), seconds), hurried=hurried,
+        slices = in_slices(
+            lambda _, last: self._call(ITERATE, last), self._log,
+            lambda row, seconds: watch(Measures(*row), seconds), functions_of(self._stages.problem),
+            0.0 if hurried else ATTENTION,
         )  # fmt: skip
-        for self._iterations, outcome, _ in slices:
+        for (self._iterations, outcome), _ in slices:
             if outcome != RUNNING:
                 break
         if outcome == RUNNING:
@@ -437,29 +437,6 @@ class InteriorPoint:
             pressing=pressing, solved=solved, flat=bool(self._memory["unchanged"][0] >= FLAT_BEFORE_END),
             sizes=self._sizes, scale=float(self._memory["scale"][0]),
         )  # fmt: skip
-
-
-def _in_slices(
-    problem: Problem, log: StructuredArray, run: Callable[[int, int], tuple[int, int]],
-    watch: Callable[[tuple[Any, ...], float], bool], *, hurried: bool,
-) -> Iterator[tuple[int, int, bool]]:  # fmt: skip
-    """Run iterations as long as the log has room. After each slice, their number, the outcome, and whether it is over.
-
-    It is over once `watch` is true for one of the slice's rows in the log and its seconds. If `hurried`, a slice is one
-    iteration, else some of `ATTENTION` seconds.
-    """
-    functions, done, over, size = functions_of(problem), 0, False, 1
-    while not over and done < len(log):
-        first, clock = done, time.perf_counter()
-        done, outcome = run(first, min(first + size, len(log)))
-        seconds = (time.perf_counter() - clock) / max(done - first, 1)
-        for row in log[first:done].tolist():
-            over = watch(row, seconds) or over
-        if error := interrupt_of(functions):
-            raise error
-        if not hurried and not functions:
-            size = max(1, int(ATTENTION / max(seconds, 1e-9)))
-        yield done, outcome, over
 
 
 class Restored(NamedTuple):
@@ -498,7 +475,8 @@ def restore(
 
     run(0, 0)
     outcome, at_minimum = RUNNING, False
-    for _, outcome, ended in _in_slices(stages.problem, log, run, watch, hurried=hurried):
+    functions = functions_of(stages.problem)
+    for (_, outcome), ended in in_slices(run, log, watch, functions, 0.0 if hurried else ATTENTION):
         if outcome == NO_PROGRESS and not ended:
             shares = stages.by_constraint(work.relative_multipliers.reshape(stages.live.shape))
             at_minimum = stationary(Motion(*map(np.copy, work.plan)), shares)
