@@ -1,5 +1,6 @@
 """The result of a solve: a plan with its feedback law, and how it was found. NumPy only."""
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Self
@@ -25,6 +26,7 @@ from lqrsim.results.solution_parts import (
     Status,
     TotalCost,
     Trajectory,
+    joined,
     left_after,
 )
 
@@ -187,6 +189,11 @@ class Solution(Plan):
         vars(solution).update(parts, _later=later)
         return solution
 
+    def _examined_by(self, examine: Callable[[], BetweenKnots]) -> "Solution":
+        """This solution, which from now on can say what its plan does between its knots."""
+        vars(self)["_examine_between_knots"] = functools.cache(examine)
+        return self
+
     def __getattr__(self, name: str) -> Any:
         later = vars(self).get("_later", {})
         if name not in later:
@@ -256,7 +263,7 @@ class Solution(Plan):
         return {
             "inverse_policy": None, "cost_to_come": None, "candidates": (),
             "clearance": None if self.clearance is None else shift(self.clearance),
-            "detail": f"the rest of a solution after {steps} steps; {self.detail}".removesuffix("; "),
+            "detail": joined(f"the rest of a solution after {steps} steps", self.detail),
         }  # fmt: skip
 
     def open_loop(self) -> "Solution":

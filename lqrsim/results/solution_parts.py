@@ -25,6 +25,11 @@ def left_after(steps: int, array: npt.ArrayLike, *, filled: bool) -> Array:
     return np.concatenate([remaining, np.repeat(array[-1:], steps, axis=0)]) if filled and steps else remaining
 
 
+def joined(*parts: str) -> str:
+    """The parts of a detail, those that say something, as one text."""
+    return "; ".join(filter(None, parts))
+
+
 @checked
 @dataclass(frozen=True, eq=False)
 class Trajectory:

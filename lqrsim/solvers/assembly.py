@@ -17,7 +17,7 @@ from lqrsim.problem.obstacles import each_once
 from lqrsim.problem.problem import Problem
 from lqrsim.results.goal import Target, departure
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory
+from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory, joined
 from lqrsim.rotations import AXES, quaternion, rotation_vector
 from lqrsim.solvers import compiled
 from lqrsim.solvers.certify import LAW, MOTION
@@ -75,7 +75,7 @@ def assemble(
     return Solution._assembled(
         later,
         status=result.status,
-        detail="; ".join(part for part in said if part),
+        detail=joined(*said),
         remedy=remedy_of(problem, result, log, options, shorter=shorter),
         policy=policy(*law, nominal[:-1]),
         cost_to_go=deepcopy(result.values.get("cost_to_go")),
@@ -107,7 +107,7 @@ def _with_risk(run: SolveRun, result: RunResult) -> str:
     most = run.largest_risk(risk) * (1 - 1e-5)  # so that even the rounded number works
     too_high = f"about the best plan a risk of {risk:g} is too high at step {failed} of {steps}"
     too_high += f", and at most {most:.5g} will do"
-    return f"{too_high}; {result.detail}" if result.detail else too_high
+    return joined(too_high, result.detail)
 
 
 def parts_of(problem: Problem) -> dict[str, str]:

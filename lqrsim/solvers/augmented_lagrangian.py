@@ -20,10 +20,10 @@ from lqrsim.kernels import declarations
 from lqrsim.kernels.records import LOG, Motion
 from lqrsim.problem.parts import allowed_violation, violation_of, weighing_obstacles
 from lqrsim.problem.problem import Problem
-from lqrsim.results.solution_parts import Moments, Multipliers, Status
+from lqrsim.results.solution_parts import Moments, Multipliers, Status, joined
 from lqrsim.solvers.certify import certified
 from lqrsim.solvers.compiled import ConstraintMultipliers
-from lqrsim.solvers.engine import RunResult, SolveRun
+from lqrsim.solvers.engine import RunResult, SolveRun, copied
 from lqrsim.solvers.settings import InitialGuess
 
 INITIAL = 8.0  # initial penalty, relative to the cost of changing the constraint's value
@@ -77,8 +77,7 @@ def meet_constraints(run: SolveRun, unconstrained: RunResult | None, *, stale: i
             return unconstrained
         lagrangian.start()
         run.weigh_noise(unconstrained.plan)
-        plan = Motion(*map(np.copy, unconstrained.plan))  # the arrays will be overwritten
-        unconstrained = replace(unconstrained, plan=plan)
+        unconstrained = replace(unconstrained, plan=copied(unconstrained))  # the arrays will be overwritten
     undamped = _undamped(run, lagrangian, known=unconstrained is None, patience=stale)
     if undamped.success or not run.settings.safeguard or run.budget.over:
         return undamped
@@ -222,7 +221,7 @@ def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunRe
             break
         lagrangian.update()
         rough = rough and lagrangian.stuck == 0 and not lagrangian.nearly
-    status, detail = Status.MAX_ITERATIONS, f"{why}; {lagrangian.worst()}".removeprefix("; ")
+    status, detail = Status.MAX_ITERATIONS, joined(why, lagrangian.worst())
     missed = not lagrangian.kept and not lagrangian.nearly
     stuck = missed and (lagrangian.stuck == STUCK or lagrangian.grown > LARGEST)
     if stuck:

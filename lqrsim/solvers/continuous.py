@@ -29,7 +29,7 @@ from lqrsim.errors import Array, InputError, check_array, check_function, excerp
 from lqrsim.problem.derivative_check import check_functions, check_start, functions_of
 from lqrsim.problem.parts import terms_of
 from lqrsim.problem.problem import FixedState, Problem
-from lqrsim.results.solution_parts import Iteration, Quadratic, Status
+from lqrsim.results.solution_parts import Iteration, Quadratic, Status, joined
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import Callback
 from lqrsim.solvers.linear_quadratic import WEIGH_MORE, Stage, check_end, definite
@@ -469,7 +469,7 @@ def smooth_continuous(
     if status not in (Status.CONVERGED, Status.MAX_ITERATIONS):
         remedy = "raise the control weight" if FLAT in detail else "solve with smooth, whose steps only lower the cost"
     return ContinuousSolution(
-        status=status, detail=f"{detail}; {raised}" if detail and raised else detail, remedy=remedy,
+        status=status, detail=joined(detail, raised if detail else ""), remedy=remedy,
         horizon=solver.horizon, iterations=tuple(iterations),
         _backward=solver.backward, _forward=solver.forward,
     )  # fmt: skip

@@ -28,6 +28,7 @@ from lqrsim.results.solution_parts import (
     Quadratic,
     Status,
     Trajectory,
+    joined,
 )
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import ATTENTION, Budget, in_slices
@@ -308,7 +309,7 @@ class SolveRun:
         ending = self.descend(NEWTON_STEPS._replace(patient=patient), self.final, added=added, least=least)
         status = ending.status
         if ending.outcome == declarations.STALLED:
-            detail = f"{detail}; Newton's method makes no progress".removeprefix("; ")
+            detail = joined(detail, "Newton's method makes no progress")
         if patient and ending.outcome != declarations.TIMED_OUT and not status.success and self.work.memory["damping"]:
             status = Status.NOT_POSITIVE_DEFINITE  # its last models had no minimum without weights
         return self.damped_result(ending, status, detail)
@@ -430,9 +431,8 @@ class SolveRun:
         cost = self.work.cost
         if not np.isfinite(cost) or (not cost < last.cost and last.values):
             return last
-        detail = f"{last.detail}; the plan is the best so far" if last.detail else "the plan is the best so far"
         status = Status.MAX_ITERATIONS if last.status is Status.DIVERGED else last.status  # this plan did not
-        return self.about_plan(status, detail)
+        return self.about_plan(status, joined(last.detail, "the plan is the best so far"))
 
     def damped_result(self, ending: Ending, status: Status, detail: str) -> RunResult:
         """Result of damped iterations or Newton's: the plan, with policy and value functions about it."""
@@ -456,9 +456,9 @@ class SolveRun:
                 why = f"the states of least total cost are {off:.1g} off the plan"
                 if not np.isfinite(off):
                     why = "its pass needs a cost that is curved in every control"
-                detail += f"; the cost-to-come is left out: {why}"
+                detail = joined(detail, f"the cost-to-come is left out: {why}")
         return RunResult(
-            status=status, detail=detail.removeprefix("; "), plan=work.best, law=law, cost=work.cost,
+            status=status, detail=detail, plan=work.best, law=law, cost=work.cost,
             violation=self._violation_of(work.best), gap=gap, values=values,
         )  # fmt: skip
 

@@ -23,7 +23,7 @@ from lqrsim.problem.dynamics import Dynamics
 from lqrsim.problem.formulas import SymbolicConstraint, SymbolicCost
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory
+from lqrsim.results.solution_parts import Candidate, Iteration, Status, Trajectory, joined
 from lqrsim.solvers.budget import Budget, Laps, Stop
 from lqrsim.solvers.multistart import Way, ways
 from lqrsim.solvers.settings import InitialGuess, SmootherSettings, resampled, resolve
@@ -368,11 +368,11 @@ class DurationSearch:
             status, remedy = Status.TIME_LIMIT, "raise time_limit"
         elif not self._budget.left or chosen.status is Status.MAX_ITERATIONS:
             status, remedy = Status.MAX_ITERATIONS, "raise max_iterations"
-        detail = f"the best duration was not found, this plan takes {chosen.trajectory.horizon:g} s; {chosen.detail}"
+        detail = f"the best duration was not found, this plan takes {chosen.trajectory.horizon:g} s"
         log = (*first.iterations, *self._budget.log, *(chosen.iterations if chosen is not first else ()))
         self._total += len(self._budget.log)
         return self._described(replace(
-            chosen, status=status, detail=detail.removesuffix("; "), iterations=log,
+            chosen, status=status, detail=joined(detail, chosen.detail), iterations=log,
             remedy=f"{remedy}; or begin with start=solution of a fixed duration (duration=None, time_weight=0)",
         ))  # fmt: skip
 
@@ -390,7 +390,7 @@ class DurationSearch:
         return replace(
             solution,
             options=dict(solution.options) | {"duration": f"{low:g} to {high:g} s{price}"},
-            detail="; ".join(part for part in (solution.detail, effort) if part),
+            detail=joined(solution.detail, effort),
             candidates=(*self.candidates, *solution.candidates),
         )
 

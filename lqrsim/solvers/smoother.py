@@ -6,13 +6,12 @@ right what a plan does between its knots (`between_knots.py`), and leave the las
 """
 
 import contextlib
-import functools
 import logging
 from collections.abc import Callable, Iterable
 from concurrent.futures import as_completed
 from dataclasses import fields, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -350,35 +349,51 @@ def solve(problem: Problem, settings: SmootherSettings, stop: Stop | None = None
     solution = solve_part(problem, settings)
     substeps = solution.options.get("substeps")  # of dynamics whose single steps may be too coarse to look with
     seen = replace(problem, dynamics=problem.dynamics.with_substeps(substeps)) if isinstance(substeps, int) else problem
-    vars(solution)["_examine_between_knots"] = functools.cache(partial(between_knots, seen, solution.trajectory))
-    return solution
+    return solution._examined_by(partial(between_knots, seen, solution.trajectory))
+
+
+class _Pass(NamedTuple):
+    """A problem that `solve_fixed` solves, and what may follow."""
+
+    problem: Problem
+    settings: SmootherSettings
+    refinements: int = REFINEMENTS  # of constraints along a plan, which are left
+    preliminary: bool = False  # whether its plan is to be refined once more, with the caller's settings
+    outlined: bool = False  # whether its constraints are refined along an outline
 
 
 def solve_fixed(problem: Problem, settings: SmootherSettings, stop: Stop, *, trees: bool = True) -> Solution:
     """Solve a problem of fixed duration, and again with constraints that the plan misses within its periods refined."""
-    stated, original, log = problem, settings, tuple[Iteration, ...]()
+    now, log = _Pass(problem, settings), tuple[Iteration, ...]()
     if any(constraint._rough for constraint in problem.constraints):
-        problem, settings, log = _outlined(problem, settings, stop)
-    refinements, preliminary, by_outline = REFINEMENTS, settings is not original, problem is not stated
+        outlined, rough, log = _outlined(problem, settings, stop)
+        now = _Pass(outlined, rough, preliminary=rough is not settings, outlined=outlined is not problem)
     while True:
-        solution = Search(problem, settings, stop).solve(trees=trees)
-        refined = problem._refined(solution.trajectory) if solution.success and refinements and not stop.due else None
+        solution = Search(now.problem, now.settings, stop).solve(trees=trees)
         if log:
             solution = replace(solution, iterations=(*log, *solution.iterations))
-        log = solution.iterations
-        failed = (
-            solution.status in (Status.INFEASIBLE, Status.STALLED) and np.isfinite(solution.trajectory.states).all()
-        )
-        if failed and by_outline and not stop.due:  # no plan may keep the constraints as they are along the outline
-            problem, settings, _ = _outlined(stated, replace(original, start=solution.trajectory, starts=None), stop)
-            by_outline = False
-            continue
-        allowed = original.violation_tolerance(problem)
-        settled = solution.status is Status.COST_CONVERGED and solution.violation <= allowed
-        if refined is None and not (preliminary and solution.success and not settled and not stop.due):
+        following = None if stop.due else _following(now, solution, problem, settings, stop)
+        if following is None:
             return stop.finish(solution)
-        problem, settings = refined or problem, replace(original, start=solution, starts=None)
-        refinements, preliminary, by_outline = refinements - 1, False, False
+        now, log = following, solution.iterations
+
+
+def _following(now: _Pass, solution: Solution, stated: Problem, original: SmootherSettings, stop: Stop) -> _Pass | None:
+    """What to solve after a solution of the stated problem with the original settings; None if it is the answer."""
+    failed = solution.status in (Status.INFEASIBLE, Status.STALLED) and solution.trajectory.finite
+    if failed and now.outlined:  # no plan may keep the constraints as they are along the outline
+        problem, settings, _ = _outlined(stated, replace(original, start=solution.trajectory, starts=None), stop)
+        return now._replace(problem=problem, settings=settings, outlined=False)
+    if not solution.success:
+        return None
+    again = replace(original, start=solution, starts=None)
+    if now.refinements and (refined := now.problem._refined(solution.trajectory)) is not None:
+        return _Pass(refined, again, now.refinements - 1)
+    allowed = original.violation_tolerance(now.problem)
+    settled = solution.status is Status.COST_CONVERGED and solution.violation <= allowed
+    if now.preliminary and not settled:
+        return _Pass(now.problem, again, now.refinements - 1)
+    return None
 
 
 def _outlined(

@@ -10,6 +10,7 @@ import functools
 import threading
 import time
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -432,7 +433,7 @@ class InteriorPoint:
         for row, (sign, i, _) in zip(np.flatnonzero(stages.owners == -1), stages.limits, strict=True):
             pressing[:, i] -= sign * stages.force[:-1, row]
         return InteriorResult(
-            plan=Motion(*map(np.copy, self._arrays.now.plan)), gain=stages.about.policy.gain,
+            plan=deepcopy(self._arrays.now.plan), gain=stages.about.policy.gain,
             measures=Measures.of(self._memory), multipliers=tuple(stages.by_constraint(stages.force)),
             pressing=pressing, solved=solved, flat=bool(self._memory["unchanged"][0] >= FLAT_BEFORE_END),
             sizes=self._sizes, scale=float(self._memory["scale"][0]),
@@ -479,12 +480,12 @@ def restore(
     for (_, outcome), ended in in_slices(run, log, watch, functions, 0.0 if hurried else ATTENTION):
         if outcome == NO_PROGRESS and not ended:
             shares = stages.by_constraint(work.relative_multipliers.reshape(stages.live.shape))
-            at_minimum = stationary(Motion(*map(np.copy, work.plan)), shares)
+            at_minimum = stationary(deepcopy(work.plan), shares)
         if at_minimum or outcome not in (RUNNING, NO_PROGRESS):
             break
     if outcome == NOT_FINITE:
         return None
-    return Restored(Motion(*map(np.copy, work.plan)), at_minimum, bool(memory["nearly_feasible"][0]))
+    return Restored(deepcopy(work.plan), at_minimum, bool(memory["nearly_feasible"][0]))
 
 
 class ActiveSet:
@@ -556,7 +557,7 @@ class ActiveSet:
         about, steps = self._stages.about, self._stages.steps
         self._call(active_set.ROLL_OUT)
         values = [rows.reshape(steps + 1, -1) for rows in about.values]
-        return Motion(*map(np.copy, self._arrays.out)), about.policy.gain.copy(), self.measures.cost, values
+        return deepcopy(self._arrays.out), about.policy.gain.copy(), self.measures.cost, values
 
     def multipliers(self) -> tuple[Multipliers, ...]:
         """The multipliers of each constraint, with a penalty."""

@@ -25,7 +25,7 @@ from lqrsim.problem.problem import Problem
 from lqrsim.problem.quadratic_cost import QuadraticCost
 from lqrsim.results.goal import TOLERANCE, Target
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Candidate, Curvature, Status, Trajectory
+from lqrsim.results.solution_parts import Candidate, Curvature, Status, Trajectory, joined
 from lqrsim.solvers import compiled, multistart
 from lqrsim.solvers.assembly import assemble, clearance_of
 from lqrsim.solvers.budget import Budget, Stop
@@ -579,7 +579,7 @@ class Search:
         run = self._add(guess_from(plans[origin], "a plan for softer contacts"))
         ended = self._finish(run, refine, most=most)
         stages = ", ".join([*before, *(name for name, _ in soft)])
-        detail = f"begun with contacts of softness {stages}{origin}; {ended.detail}".removesuffix("; ")
+        detail = joined(f"begun with contacts of softness {stages}{origin}", ended.detail)
         ended = replace(ended, detail=detail)
         self._offer(run, ended, better=self._is_better(ended))
         return ended
@@ -605,7 +605,7 @@ class Search:
         if result is None:
             return False
         self._named.append(("the best plan, within its contact modes", run))
-        detail = "; ".join(part for part in (plan.detail.partition("; ")[0], result.detail) if part)
+        detail = joined(plan.detail.partition("; ")[0], result.detail)
         self._offer(run, replace(result, detail=detail), better=result.rank <= self.best[1].rank)
         return True
 
@@ -616,15 +616,15 @@ class Search:
             result = replace(result, status=Status.NOT_FINITE, detail=left_domain(problem, result))
         elif result.status is Status.INFEASIBLE and not self.tried and stop.error is None:
             untried = "no time was left for other starts, which may keep the constraints"
-            result = replace(result, status=Status.TIME_LIMIT, detail=f"{result.detail}; {untried}")
+            result = replace(result, status=Status.TIME_LIMIT, detail=joined(result.detail, untried))
         elif self._cut_short and np.isfinite(result.cost):
             untried = "no time was left for further attempts, which may find a better plan"
-            result = replace(result, status=Status.TIME_LIMIT, detail=f"{result.detail}; {untried}".removeprefix("; "))
+            result = replace(result, status=Status.TIME_LIMIT, detail=joined(result.detail, untried))
         elif not stop.due or (self._still is not None and not self._comes_nearer(result)):
             result = self._with_unmoved_states(result)
         if result.success and (cheapest := self._cheaper_elsewhere(CHEAPER)) is not None:
             other = self._unfinished(*self._finished[cheapest])
-            result = replace(result, detail="; ".join(filter(None, (result.detail, other))))
+            result = replace(result, detail=joined(result.detail, other))
         tolerances = {"tolerance": chosen.final, "constraint_tolerance": self._allowed}
         begun = self._named[0][1] if settings.start is not None else chosen
         options = settings.options(begun.initial_guess) | tolerances
@@ -662,7 +662,7 @@ class Search:
             remedy = f"begin with start=[...], controls {clause}"
         if self._stop.due:
             status, remedy = Status.TIME_LIMIT, ""
-        return replace(result, status=status, detail="; ".join(filter(None, parts)), remedy=remedy)
+        return replace(result, status=status, detail=joined(*parts), remedy=remedy)
 
     def _of_approaches(self, result: RunResult, *, untouched: bool) -> str:
         """In words, what came of motions that were to bring states nearer to their goal that a plan does not change."""
@@ -799,7 +799,7 @@ def left_domain(problem: Problem, result: RunResult) -> str:
         if not np.isfinite(number)
     ]
     place = f"at {step * problem.dt:.2f} s (step {step} of {problem.steps}) {' and '.join(left)}"
-    return "; ".join(part for part in (place, result.detail if "nan" not in result.detail else "") if part)
+    return joined(place, "" if "nan" in result.detail else result.detail)
 
 
 def line_of_states(problem: Problem) -> Trajectory:
