@@ -69,8 +69,8 @@ def moved(robot: ls.MjcfRobot, solution: ls.Solution) -> Array:
 @pytest.fixture
 def no_further(monkeypatch: pytest.MonkeyPatch) -> None:
     """Solves end with the attempt that moves a body. The others make plans cheaper, and take most of the time."""
-    for attempt in ("retry_without_risk", "soften_contacts", "keep_given", "alternate_softness", "leave_contact_modes"):
-        monkeypatch.setattr(strategy.Search, attempt, lambda search: None)
+    for attempt in ("soften", "alternate", "leave_contact_modes"):
+        monkeypatch.setattr(strategy.Softening, attempt, lambda softening: None)
 
 
 def check_moved(

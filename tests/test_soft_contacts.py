@@ -251,8 +251,8 @@ def test_a_failed_plan_among_contacts_says_that_time_was_over(monkeypatch: pytes
     def run(search: strategy.Search) -> None:
         """As if no step had lowered the cost of the first plan any more."""
         real(search)
-        first, found = search._finished[0]
-        search._finished[0] = first, replace(found, status=ls.Status.STALLED, detail="no step lowers the cost")
+        first, found = search.finished[0]
+        search.finished[0] = first, replace(found, status=ls.Status.STALLED, detail="no step lowers the cost")
 
     monkeypatch.setattr(strategy.Search, "finish_promising", run)
     solution = smoother.solve(problem, replace(options, time_limit=limit))
@@ -266,8 +266,8 @@ def test_a_plan_for_softer_contacts_is_a_start_with_iterations_of_its_own(
     monkeypatch: pytest.MonkeyPatch, limit: int
 ) -> None:
     """However many the first start has used."""
-    for attempt in ("alternate_softness", "leave_contact_modes"):
-        monkeypatch.setattr(strategy.Search, attempt, lambda search: None)
+    for attempt in ("alternate", "leave_contact_modes"):
+        monkeypatch.setattr(strategy.Softening, attempt, lambda softening: None)
     solution = ls.smooth(hop(robot_of("leg", 1.0)), max_iterations=limit)
     used = {one.start: one.iterations for one in solution.candidates}
     assert used["nominal control"] == used["a plan for softer contacts"] == limit

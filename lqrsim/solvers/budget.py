@@ -225,9 +225,9 @@ class Laps:
 
 
 def in_slices(
-    run: Callable[[int, int], Sequence[int]], log: StructuredArray, watch: Callable[[tuple[Any, ...], float], bool],
+    run: Callable[[int, int], Sequence[Any]], log: StructuredArray, watch: Callable[[tuple[Any, ...], float], bool],
     functions: Sequence[UserFunction], attention: float, *, first: int = 0,
-) -> Iterator[tuple[Sequence[int], bool]]:  # fmt: skip
+) -> Iterator[tuple[Sequence[Any], bool]]:  # fmt: skip
     """Run compiled iterations from `first` on, as long as the log has room for their rows.
 
     A slice is some of `attention` seconds: 0 for one iteration, as if plain Python functions are to be heard, infinity

@@ -522,7 +522,7 @@ class SolveRun:
         if first < last and stop.due:
             return Ending(declarations.TIMED_OUT, len(budget.log))
 
-        def run(begin: int, end: int) -> Sequence[int]:
+        def run(begin: int, end: int) -> Sequence[Any]:
             nonlocal missed
             ended = self._loop(*arguments(begin, end, rows))
             if ended[0] > begin:
@@ -530,8 +530,9 @@ class SolveRun:
             return ended
 
         def watch(row: tuple[Any, ...], seconds: float) -> bool:
-            *numbers, method = row
-            budget.record(Iteration(*numbers, missed, seconds, _METHODS[int(method)]))
+            cost, improvement, gap, optimality, residual, method = row
+            name = _METHODS[int(method)]
+            budget.record(Iteration(cost, improvement, gap, optimality, residual, missed, seconds, name))
             return stop.error is not None
 
         ending, clock = Ending(declarations.RUNNING), time.perf_counter()

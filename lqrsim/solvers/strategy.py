@@ -3,10 +3,6 @@
 `Search.solve` and `Search.choose_start` say what is tried in which order, and when; `finish.py` says what is done from
 one start. The budget of each start is `max_iterations`; all starts share one deadline (`budget.py`). Every answer is
 certified (`certify.py`).
-
-Some goals no control comes nearer to: the change of a state with every control of a plan is zero. Such a plan is
-stationary, but says nothing: a box that nothing touches does not move, whatever the weight of its place.
-`Search.push_and_approach` looks for plans that change them.
 """
 
 import contextlib
@@ -69,7 +65,67 @@ Finish = Callable[[SolveRun, Known], RunResult]
 Start = StartLike | InitialGuess
 
 
-class Search:
+class Runs:
+    """The runs of a search: how they begin and end, which are named among the candidates, and the results so far.
+
+    Attributes:
+      allowed: the largest violation of a constraint. known: what the runs know of one another.
+    """
+
+    def __init__(self, problem: Problem, settings: SmootherSettings, stop: Stop) -> None:
+        self.problem, self.settings, self.stop = problem, settings, stop
+        self.allowed, self.known = settings.violation_tolerance(problem), Known()
+        self.named: list[tuple[str, SolveRun]] = []
+        self.finished: list[tuple[SolveRun, RunResult]] = []
+
+    @property
+    def best(self) -> tuple[SolveRun, RunResult]:
+        """The run with the best result so far, and that result."""
+        return self.finished[0]
+
+    def another(self, start: Start, problem: Problem | None = None) -> SolveRun:
+        """A run from another start, perhaps of another problem."""
+        problem, budget = problem or self.problem, Budget(self.settings.max_iterations, self.stop)
+        return SolveRun(problem, self.settings, resolve(start, problem), self.problem._start_or_zero, budget)
+
+    def add(self, start: Start, name: str | None = None) -> SolveRun:
+        """A run from another start that is one of the candidates."""
+        run = self.another(start)
+        self.named.append((str(run.initial_guess.summary) if name is None else name, run))
+        return run
+
+    def result_of(
+        self, run: SolveRun, how: Finish = finish, *, most: int | None = None, known: Known | None = None
+    ) -> RunResult:
+        """Run to the end, or `most` iterations more. The callback is called for all iterations of the run so far, too.
+
+        What is known of the search's problem is not known of another.
+        """
+        run.budget.report()
+        known = known or (self.known if run.problem is self.problem else Known())
+        with run.problem.dynamics.solving(self.stop.threads), run.budget.limited(most):
+            return how(run, known)
+
+    def try_from(self, name: str, start: Start, how: Finish = finish) -> None:
+        """Finish a run from another start, which is one of the candidates, and record its result."""
+        run = self.add(start, name)
+        self.offer(run, self.result_of(run, how))
+
+    def offer(self, run: SolveRun, result: RunResult, *, better: bool | None = None) -> None:
+        """Record a result; it becomes the best if `better` says so, by default if its rank does."""
+        self.finished.insert(0 if better else len(self.finished), (run, result))
+        if better is None:
+            self.finished.sort(key=lambda pair: pair[1].rank)  # a stable sort: of equal ranks, the first result
+
+    def cheaper_elsewhere(self, less: float) -> int | None:
+        """Number of the cheapest plan that keeps the constraints, if it costs less than the best by this share."""
+        allowed, best = self.allowed, self.best[1].cost
+        kept = [result.violation <= allowed and np.isfinite(result.cost) for _, result in self.finished]
+        costs = np.where(kept, [result.cost for _, result in self.finished], np.inf)
+        return int(np.argmin(costs)) if costs.min() < best - less * abs(best) else None
+
+
+class Search(Runs):
     """Runs from several starts, the most promising of which are finished."""
 
     def __init__(
@@ -77,8 +133,8 @@ class Search:
         starts: Sequence[tuple[str, Start]] = (),
     ) -> None:  # fmt: skip
         """By default from the caller's start, or the usual ones."""
-        self._problem, self._settings, self._stop, self._threads = problem, settings, stop, stop.threads
-        self._exact, self._allowed = settings.second_order(problem), settings.violation_tolerance(problem)
+        super().__init__(problem, settings, stop)
+        self._exact = settings.second_order(problem)
         self._guided = multistart.path_weight(problem) > 0  # whether obstacles in the cost push the plan
         self._default = settings.start is None and settings.starts is None  # not by the caller's choice
         self.tried = not settings.safeguard  # whether other starts were tried, as far as they are to be
@@ -87,55 +143,39 @@ class Search:
                 starts = [(CALLERS_START, resolve(settings.start, problem).penalised(problem, settings.penalty))]
             guesses = [(name, resolve(start, problem)) for name, start in starts or guides(problem, settings.starts)]
             check_functions(problem, guesses[0][1].offset[0].copy())
-            self._named = [(name, self._another(guess)) for name, guess in guesses]
-        self._solving = self._threads if len(self._named) == 1 else 1
-        self._known = Known()
-        self._finished: list[tuple[SolveRun, RunResult]] = []
-        self._unmoved_of = dict[RunResult, list[int]]()  # by the plan
-        # A plan and states that miss their goal, which no control changes along it; the best plan that brings them
-        # nearer, with the name of its start; the approaches that were tried; and the name and the cost of the cheapest
-        # start that brings them nearer.
-        self._still: tuple[RunResult, list[int]] | None = None
-        self._best_nearer: tuple[str, RunResult] | None = None
-        self._approached: list[str] = []
-        self._nearer: tuple[str, float] | None = None
-        self._softer: list[Candidate] = []  # plans for softer contacts
-        self._soft: list[tuple[str, Problem]] = []  # the problem with contacts of each softness, the widest first
-
-    @property
-    def best(self) -> tuple[SolveRun, RunResult]:
-        """The run with the best result so far, and that result."""
-        return self._finished[0]
+            self.named = [(name, self.another(guess)) for name, guess in guesses]
+        self._solving = self.stop.threads if len(self.named) == 1 else 1
+        self._approaches = Approaches(self)
+        self._softening = Softening(self, self._approaches)
 
     def solve(self, *, trees: bool) -> Solution:
         """The answer after all attempts, no worse than a plan that the caller gave; `trees` if they may grow."""
-        begun = [run for _, run in self._named]
+        begun = [run for _, run in self.named]
         guess = begun[0].initial_guess
-        is_plan = self._settings.start is not None and guess.prior is None and guess.interior is None
+        is_plan = self.settings.start is not None and guess.prior is None and guess.interior is None
         given = _given(begun[0]) if is_plan else None
-        with self._stop.reporting("smooth"):
+        with self.stop.reporting("smooth"):
             # The attempts after this block also solve problems with other dynamics, and set the threads for each.
-            with self._problem.dynamics.solving(self._solving):
+            with self.problem.dynamics.solving(self._solving):
                 self.choose_start()
                 if trees and self.may_go_on and self.is_barred:
                     self.grow_trees()
-                if self._settings.start is None and self._exact and not self._guided:
+                if self.settings.start is None and self._exact and not self._guided:
                     self.try_detours()
                 self.leave_saddles()  # while the best plan is one
-            if self._default and self.may_go_on and self._unmoved():
-                self.push_and_approach()
-            too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self._named)
-            if self._problem.risk > 0 and too_high and self.may_go_on:
+            if self._default and self.may_go_on and self._approaches.unmoved():
+                self._approaches.push_and_approach()
+            too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self.named)
+            if self.problem.risk > 0 and too_high and self.may_go_on:
                 self.retry_without_risk()
-            alone = self._best_nearer is not None and not self._comes_nearer(self.best[1])  # it leaves a body alone
-            if self._default and self.may_go_on and (alone or not self.best[1].success):
-                self.soften_contacts()
+            if self._default and self.may_go_on and (self._approaches.left_alone or not self.best[1].success):
+                self._softening.soften()
             if given is not None:
                 self.keep_given(given)
             if not self.best[1].success and self.may_go_on:
-                self.alternate_softness()
+                self._softening.alternate()
             if not self.best[1].success and self.may_go_on:
-                self.leave_contact_modes()
+                self._softening.leave_contact_modes()
         solution = self._solution()
         for run in begun:
             run.give_back()
@@ -145,7 +185,7 @@ class Search:
         """Finish the most promising of the given starts, and of others where it leads to a poor plan; the best run."""
         self.finish_promising()
         lost = not np.isfinite(self.best[1].cost) and self.best[1].status is not Status.RISK_TOO_HIGH
-        if lost and self._problem.start is not None and not self._stop.due:
+        if lost and self.problem.start is not None and not self.stop.due:
             self.try_finite()
         if self.needs_others and self.is_barred:
             self.try_past_constraints()
@@ -159,24 +199,24 @@ class Search:
 
     def finish_promising(self) -> None:
         """Finish the most promising run; with constraints, also the others, as long as they may cost less."""
-        problem = self._problem
-        chosen, *others = choose([run for _, run in self._named], self._threads)
+        problem = self.problem
+        chosen, *others = choose([run for _, run in self.named], self.stop.threads)
         driven = 2 * len(problem.control_coordinates) >= len(problem.dynamics.state_coordinates)
         known = problem.start is not None and problem.goal is not None
         # Where exact second derivatives are known, or constraints are to be kept, other methods follow smoothing.
         plain = not problem.constraints and self._default and not self._exact
-        if driven and known and plain and self._settings.safeguard:
+        if driven and known and plain and self.settings.safeguard:
             chosen = self.smooth_or_follow_a_line(chosen)
-        self._offer(chosen, self._finish(chosen))
+        self.offer(chosen, self.result_of(chosen))
         if not problem.constraints:
             return
         # Constraints can make the best route the worst, or close it. The costs of the other runs so far, without
         # constraints, are approximate lower bounds on their costs with constraints.
         for run in sorted(others, key=lambda run: run.cost):
             best = self.best[1]
-            if self._stop.due or best.final or (best.success and not run.cost < best.cost):
+            if self.stop.due or best.final or (best.success and not run.cost < best.cost):
                 break
-            self._offer(run, self._finish(run))
+            self.offer(run, self.result_of(run))
 
     def smooth_or_follow_a_line(self, run: SolveRun) -> SolveRun:
         """If smoothing fails for an arm, say, whose every joint has a motor, the run from a line of states, if cheaper.
@@ -184,111 +224,111 @@ class Search:
         From the controls that hold an arm, the first plans may swing it through itself or the floor, where plans stay.
         """
         run.budget.report()
-        run.smooth(self._settings.max_iterations)
+        run.smooth(self.settings.max_iterations)
         unfinished = Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.RISK_TOO_HIGH
-        if run.ending.success or run.ending.status in unfinished or self._stop.due:
+        if run.ending.success or run.ending.status in unfinished or self.stop.due:
             return run
-        line = self._add(line_of_states(self._problem), "a line of states")
+        line = self.add(line_of_states(self.problem), "a line of states")
         line.budget.report()
-        line.smooth(self._settings.max_iterations)
+        line.smooth(self.settings.max_iterations)
         return line if line.ending.success or line.work.cost < run.work.cost else run
 
     def try_finite(self) -> None:
         """Where states leave their domain, try constant controls under which they do not, and a line of states."""
-        self._known.from_start = False
-        problem, work, plans = self._problem, self.best[0].work, list[tuple[float, float, Array]]()
+        self.known.from_start = False
+        problem, work, plans = self.problem, self.best[0].work, list[tuple[float, float, Array]]()
         for control, plan in multistart.constant_controls(problem):
             missed = float(f"{work.violation(work.constraint_values(plan)):.2g}")
             cost = compiled.cost_of(problem, *plan)
             if np.isfinite([missed, cost]).all():
                 plans.append((missed, cost, control))
         for _, _, control in sorted(plans, key=lambda entry: entry[:2])[:CONSTANT]:
-            self._try(f"the constant controls {', '.join(f'{u:.3g}' for u in control)}", control)
-            if self.best[1].success or self._stop.due:
+            self.try_from(f"the constant controls {', '.join(f'{u:.3g}' for u in control)}", control)
+            if self.best[1].success or self.stop.due:
                 return
         if self._exact and not np.isfinite(self.best[1].cost):
-            self._try("a line of states", line_of_states(problem), from_states)
+            self.try_from("a line of states", line_of_states(problem), from_states)
 
     def try_reweighted(self) -> None:
         """Solve with heavier obstacles, and refine the best of these plans by steps that lower the true cost."""
-        stop = self._stop
+        stop = self.stop
         for times in HEAVIER:
             if stop.due:
                 return
-            heavier = multistart.reweighted(self._problem, times)
-            runs = [self._another(guide, heavier) for _, guide in guides(heavier, None)]
+            heavier = multistart.reweighted(self.problem, times)
+            runs = [self.another(guide, heavier) for _, guide in guides(heavier, None)]
             try:
-                chosen = choose(runs, self._threads)[0]
+                chosen = choose(runs, self.stop.threads)[0]
                 chosen.budget.report()
                 heaviest = chosen.run_to_end()
             except InputError:  # the heavier cost is not finite at the start
                 continue
             if stop.due:
                 return
-            run = self._add(guess_from(heaviest, f"a plan for {times:g} times the weight of obstacles and goal"))
-            result, best = self._finish(run, refine), self.best[1]
+            run = self.add(guess_from(heaviest, f"a plan for {times:g} times the weight of obstacles and goal"))
+            result, best = self.result_of(run, refine), self.best[1]
             # The same optimum, different within the tolerances, is no improvement.
             lower = not best.success or result.cost < best.cost - 1e-3 * abs(best.cost)
-            self._offer(run, result, better=result.rank < best.rank and lower)
+            self.offer(run, result, better=result.rank < best.rank and lower)
         self.tried = not stop.due
 
     def try_elsewhere(self) -> None:
         """Try other starts until one leads to a plan, before the constraints are called infeasible."""
-        problem = self._problem
+        problem = self.problem
         if self._exact:
             self._follow_ways()
         motions = dict[str, StartLike](self._motions()) if self._exact and not self.best[1].success else {}
         sways = {sinusoidal_name(cycles): sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]}
         for name, start in (motions | sways).items():
-            if self._stop.due or self.best[1].success:
+            if self.stop.due or self.best[1].success:
                 break
-            self._known.from_start = False
+            self.known.from_start = False
             # A trajectory is on one side of the obstacles; smoothing without the constraints would leave this side. The
             # augmented Lagrangian method stays there only if it begins with the start's own plan.
-            self._try(name, start, finish if self._exact and name in sways else refine)
-        self.tried = not self._stop.due
+            self.try_from(name, start, finish if self._exact and name in sways else refine)
+        self.tried = not self.stop.due
 
     def _follow_ways(self) -> None:
         """Begin with ways of states, whatever a rollout does; all of them, because it is not known which is best."""
-        problem = self._problem
+        problem = self.problem
         for way in list(multistart.ways(problem, self.best[0].stages)):
-            if self._stop.due:
+            if self.stop.due:
                 return
-            self._known.from_start = False
-            self._try(way.name, way.over(problem), from_states)
+            self.known.from_start = False
+            self.try_from(way.name, way.over(problem), from_states)
 
     @property
     def is_barred(self) -> bool:
         """Whether no plan keeps the constraints, some of which may be passed on one side or another."""
-        return self.is_poor and self._exact and self.is_without_plan and any(passable(self._problem))
+        return self.is_poor and self._exact and self.is_without_plan and any(passable(self.problem))
 
     def try_past_constraints(self) -> None:
         """Plan without the constraints that may be passed on one side or another.
 
         A manoeuvre, such as to drive on and back, is found more often where nothing is in the way of its first plans.
         """
-        problem = self._problem
+        problem = self.problem
         pairs = zip(problem.constraints, passable(problem), strict=True)
-        _, best = self._searched(problem.with_constraints([constraint for constraint, passed in pairs if not passed]))
-        if best.success and not self._stop.due:
-            self._known.from_start = False
+        _, best = _searched(problem.with_constraints([one for one, passed in pairs if not passed]), self)
+        if best.success and not self.stop.due:
+            self.known.from_start = False
             name = "a plan without what is in the way"
-            self._try(name, guess_from(best, name), refine)
+            self.try_from(name, guess_from(best, name), refine)
 
     def grow_trees(self) -> None:
-        for seed, way in ways_by_trees(self._problem, self._stop):
-            self._try(f"trees of short plans, seed {seed}", way, from_states)
+        for seed, way in ways_by_trees(self.problem, self.stop):
+            self.try_from(f"trees of short plans, seed {seed}", way, from_states)
             if self.best[1].success:
                 return
 
     def _motions(self) -> list[tuple[str, Trajectory]]:
         """Trajectories along paths from start to goal, by name; the least violation of constraints first."""
-        problem, cost = self._problem, self.best[1].cost
+        problem, cost = self.problem, self.best[1].cost
         motions = list[tuple[float, str, Trajectory]]()
         for name, prior in multistart.along_paths(problem, self._steered(), cost if 0 < cost < np.inf else 1.0).items():
-            if self._stop.due:
+            if self.stop.due:
                 break
-            run = self._another(prior)
+            run = self.another(prior)
             run.smooth(multistart.FOLLOW)
             plan = copied(run.work.arrays.last)
             if np.isfinite(plan.states).all():
@@ -298,7 +338,7 @@ class Search:
 
     def _steered(self) -> list[int]:
         """The states that place the robot: its position, or else states on which constraints to be passed depend."""
-        problem, work, moving = self._problem, self.best[0].work, set[int]()
+        problem, work, moving = self.problem, self.best[0].work, set[int]()
         position = list(problem.dynamics.state_coordinates.position)
         if position or problem.start is None or problem.goal is None:
             return position
@@ -310,23 +350,23 @@ class Search:
         return sorted(moving)
 
     def try_sinusoidal_controls(self) -> None:
-        runs = [self._another(sinusoidal_controls(self._problem, cycles)) for cycles in SWAYS]
-        chosen = choose(runs, self._threads)[0]
-        self._named.append((sinusoidal_name(SWAYS[runs.index(chosen)]), chosen))
-        result, best = self._finish(chosen, known=Known()), self.best[1]
+        runs = [self.another(sinusoidal_controls(self.problem, cycles)) for cycles in SWAYS]
+        chosen = choose(runs, self.stop.threads)[0]
+        self.named.append((sinusoidal_name(SWAYS[runs.index(chosen)]), chosen))
+        result, best = self.result_of(chosen, known=Known()), self.best[1]
         # Even a plan that has not converged is better than doing nothing.
-        self._offer(chosen, result, better=result.violation <= best.violation and result.cost < best.cost)
-        self.tried = not self._stop.due
+        self.offer(chosen, result, better=result.violation <= best.violation and result.cost < best.cost)
+        self.tried = not self.stop.due
 
     def try_detours(self) -> None:
         """If the best plan touches a constraint that may be passed on another side, finish plans from such paths."""
-        touched = itertools.compress(self.best[1].multipliers, passable(self._problem))
+        touched = itertools.compress(self.best[1].multipliers, passable(self.problem))
         if not any(multipliers.values.any() for multipliers in touched):
             return
-        tried = {name for name, _ in self._named}
-        for name, trajectory in multistart.detours(self._problem, self._settings.starts).items():
-            if name not in tried and not self._stop.due:
-                self._try(name, trajectory)
+        tried = {name for name, _ in self.named}
+        for name, trajectory in multistart.detours(self.problem, self.settings.starts).items():
+            if name not in tried and not self.stop.due:
+                self.try_from(name, trajectory)
 
     def leave_saddles(self) -> None:
         """Go down along a direction of negative curvature, and converge from there, while the best plan is a saddle.
@@ -338,21 +378,14 @@ class Search:
             if best.certificate is None or best.certificate.curvature is not Curvature.SADDLE:
                 return
             if count == SADDLES or not self._descend(run, best):
-                status = Status.TIME_LIMIT if self._stop.due else Status.STALLED
+                status = Status.TIME_LIMIT if self.stop.due else Status.STALLED
                 detail = "a saddle: the cost falls to second order, but no plan was found beside it that costs less"
                 if count == SADDLES:
                     detail = f"a saddle: the cost falls to second order, as it did at {count} plans that were left"
-                self._finished[0] = run, replace(best, status=status, detail=detail)
-                if (cheapest := self._cheaper_elsewhere(SADDLE_DECREASE)) is not None:
-                    self._finished.insert(0, self._finished.pop(cheapest))
+                self.finished[0] = run, replace(best, status=status, detail=detail)
+                if (cheapest := self.cheaper_elsewhere(SADDLE_DECREASE)) is not None:
+                    self.finished.insert(0, self.finished.pop(cheapest))
                 return
-
-    def _cheaper_elsewhere(self, less: float) -> int | None:
-        """Number of the cheapest plan that keeps the constraints, if it costs less than the best by this share."""
-        allowed, best = self._allowed, self.best[1].cost
-        kept = [result.violation <= allowed and np.isfinite(result.cost) for _, result in self._finished]
-        costs = np.where(kept, [result.cost for _, result in self._finished], np.inf)
-        return int(np.argmin(costs)) if costs.min() < best - less * abs(best) else None
 
     def _descend(self, run: SolveRun, at_saddle: RunResult) -> bool:
         """Leave a saddle; return whether a plan was found that costs less."""
@@ -363,255 +396,52 @@ class Search:
         for size, sign in itertools.product(SADDLE_STEPS, (1, -1)):
             moved = Trajectory(
                 saddle.states + sign * size * direction.states, saddle.controls + sign * size * direction.controls,
-                self._problem.dt,
+                self.problem.dt,
             )  # fmt: skip
-            run_beside = self._another(guess_from(saddle, "a saddle"))
+            run_beside = self.another(guess_from(saddle, "a saddle"))
             run_beside.budget.report()
             result = from_beside(run_beside, moved, saddle)
-            if self._stop.due:
+            if self.stop.due:
                 break
             if result is not None and result.success and result.cost < saddle.cost - SADDLE_DECREASE * abs(saddle.cost):
-                self._named.append(("beside a saddle", run_beside))
-                self._offer(run_beside, result, better=True)
+                self.named.append(("beside a saddle", run_beside))
+                self.offer(run_beside, result, better=True)
                 return True
         return False
-
-    def push_and_approach(self) -> None:
-        """Begin with motions that change states that miss their goal and that no control changes, as of a box: pushes
-        by one control at a time, and approaches to a body that nothing touches.
-        """
-        problem, before, places = self._problem, self.best[1], self._unmoved()
-        self._still = before, places
-        plans = list[tuple[bool, float, str, Start]]()
-
-        def consider(name: str, begin: Start, plan: Motion) -> bool:
-            """Keep a plan that changes these states; return whether it takes them nearer to their goal at less cost."""
-            cost = compiled.cost_of(problem, *plan)
-            if not (np.isfinite(cost) and _differ(plan, before, places)):
-                return False
-            nearer = self._comes_nearer(plan)
-            plans.append((not nearer, cost, name, begin))
-            return nearer and cost < SAVES * before.cost
-
-        for name, controls, plan in multistart.pushes(problem):
-            consider(name, controls, plan)
-        for name, through in _approaches(problem, before, places):
-            if self._stop.due:
-                break
-            drawn = self._finish(self._another(None, through), refine, most=APPROACH).kept()
-            self._approached.append(name)
-            plan = compiled.rollout(problem, *drawn.law, before.states[0].copy())
-            if consider(name, guess_from(drawn, name), plan):
-                break
-        plans.sort(key=lambda entry: entry[:2])
-        self._nearer = next(((name, cost) for missed, cost, name, _ in plans if not missed), None)
-        for _, _, name, begin in plans[:PUSHES]:
-            run = self._add(begin, name)
-            with problem.dynamics.solving(self._threads):
-                begun, other = _given(run), self._finish(run, refine)
-            if other.is_worse(begun, run.work):  # a plan that no step can begin from is left by smoothing
-                status = Status.TIME_LIMIT if self._stop.due else Status.STALLED
-                other = replace(begun, status=status, detail="no step lowers the cost of this plan")
-            self._offer(run, other, better=before.violation >= other.violation and other.cost < self.best[1].cost)
-            if self._comes_nearer(other) and (self._best_nearer is None or other.cost < self._best_nearer[1].cost):
-                self._best_nearer = name, other
-
-    def _comes_nearer(self, plan: RunResult | Motion) -> bool:
-        """Whether a plan brings states, which no control changed along the first plan, well nearer to their goal."""
-        if self._still is None or not np.isfinite(plan.states[-1]).all():
-            return False
-        first, places = self._still
-        now, before = (_missing(self._problem, motion.states[-1], places) for motion in (plan, first))
-        return bool(np.linalg.norm(now) < (1 - NEARER) * np.linalg.norm(before))
-
-    def _is_better(self, result: RunResult) -> bool:
-        """Whether a plan is better than the best."""
-        best = self.best[1]
-        # Where only one of them moves a body that was out of reach, cost decides: to leave it alone converges easily.
-        if self._comes_nearer(result) == self._comes_nearer(best):
-            return result.rank < best.rank
-        return result.violation <= best.violation and result.cost < best.cost
-
-    def _unmoved(self) -> list[int]:
-        """The states that miss their goal and that no control changes along the best plan."""
-        problem, best = self._problem, self.best[1]
-        if not np.isfinite(best.cost):
-            return []
-        if best in self._unmoved_of:
-            return self._unmoved_of[best]
-        states, controls, end, goal = best.states, best.controls, best.states[-1], problem.goal
-        sizes = np.maximum(np.ptp(states, axis=0), 0.0 if goal is None else np.abs(np.nan_to_num(goal - end)))
-        sizes = np.where(sizes > 0, sizes, 1.0)
-        missed = np.abs(_final_cost(problem, end)[1]) * sizes > MOST_OF * abs(best.cost)
-        for i, number in goals_of(problem.constraints, problem.dynamics).items():
-            missed[i] |= abs(end[i] - number) > self._allowed
-        space, places = problem.control_coordinates, np.flatnonzero(missed)
-        span = np.subtract(space.high, space.low)
-        span = np.where(np.isfinite(span), span, np.maximum(np.abs(controls).max(axis=0), 1.0))
-        pull = np.eye(len(end))[places]
-        for state, control in zip(states[-2::-1], controls[::-1], strict=True):
-            if not len(places):
-                break
-            with np.errstate(all="ignore"):
-                a, b, _ = problem.dynamics.linearize(state, control, problem.dt)
-            still = (np.abs(pull @ b) * span).sum(axis=1) <= NONE * sizes[places]
-            places, pull = places[still], (pull @ a)[still]
-        return self._unmoved_of.setdefault(best, places.tolist())
 
     def keep_given(self, given: RunResult) -> None:
         """If the best plan is worse than the caller's, or has left what that moved, descend from the caller's plan."""
         run, best = self.best
-        still = _differ(best, given, self._unmoved())
-        worsened = still or best.is_worse(given, run.work) or _goal_left(self._problem, best, given)
-        if worsened and not self._stop.due:
-            run = self._add(guess_from(given, "descent from the given plan"))
-            other = self._finish(run, refine)
+        still = _differ(best, given, self._approaches.unmoved())
+        worsened = still or best.is_worse(given, run.work) or _goal_left(self.problem, best, given)
+        if worsened and not self.stop.due:
+            run = self.add(guess_from(given, "descent from the given plan"))
+            other = self.result_of(run, refine)
             wanted = best.is_worse(given, run.work) or (still and other.cost < best.cost) or other.rank < best.rank
-            self._offer(run, other, better=wanted and not other.is_worse(given, run.work))
+            self.offer(run, other, better=wanted and not other.is_worse(given, run.work))
         run, best = self.best
         if best.is_worse(given, run.work):
-            status = Status.TIME_LIMIT if self._stop.due else Status.STALLED
+            status = Status.TIME_LIMIT if self.stop.due else Status.STALLED
             detail = "no plan was found that is better than the given one, which is returned"
-            self._offer(run, replace(given, status=status, detail=detail), better=True)
+            self.offer(run, replace(given, status=status, detail=detail), better=True)
 
     def retry_without_risk(self) -> None:
         """Where the risk was too high for an intermediate plan, solve without risk, and continue from that plan."""
-        riskless = replace(self._problem, risk=0.0)
-        with self._problem.dynamics.solving(self._solving):
-            runs = choose([self._another(run.initial_guess, riskless) for _, run in self._named], self._threads)
-        plan = self._finish(runs[0])
-        if not plan.success or self._stop.due:
+        riskless = replace(self.problem, risk=0.0)
+        with self.problem.dynamics.solving(self._solving):
+            runs = choose([self.another(run.initial_guess, riskless) for _, run in self.named], self.stop.threads)
+        plan = self.result_of(runs[0])
+        if not plan.success or self.stop.due:
             return
         begin = guess_from(plan, "a plan without risk")
-        run = self._add(replace(begin, cost_to_go=plan.values["cost_to_go"], multipliers=plan.multipliers))
-        result = self._finish(run)
+        run = self.add(replace(begin, cost_to_go=plan.values["cost_to_go"], multipliers=plan.multipliers))
+        result = self.result_of(run)
         # Of plans whose risk is too high, this one is near an optimum.
-        self._offer(run, result, better=result.rank <= self.best[1].rank)
-
-    def soften_contacts(self) -> None:
-        """Plan for contacts and limits of decreasing softness, and then for the true ones.
-
-        Each solve begins with the policy of the previous solve, not with its controls: if a contact comes slightly
-        earlier or later, the rest of the plan must not be lost. Which optimum is found depends on where the widest
-        softness begins. So oscillating controls are tried there as well; after two softnesses their costs tell which
-        are good, and a third of the plans goes on at each. Before, a plan that moves a body at last is softened by
-        less: for the softest contacts, it would leave the body alone again.
-        """
-        problem, moved = self._problem, self._best_nearer
-        begin = self.best[1] if moved is None else moved[1]
-        self._soft = [
-            (name, replace(problem, dynamics=dynamics)) for name, dynamics in problem.dynamics.softened(begin.states)
-        ]
-        if not self._soft:
-            return
-        (name, widest), *harder = self._soft
-        if moved is not None:
-            self._stiffen({f", {moved[0]}": begin}, harder, [])
-            if self.best[1].success or self._stop.due:
-                return
-        results = {"": self._keep_softer(name, *self._searched(widest))}
-        for cycles, side in itertools.product(SWAYS, (1, -1)):
-            if not self._stop.due:
-                begin, origin = sinusoidal_controls(widest, side * cycles), f", {sinusoidal_name(side * cycles)}"
-                results[origin] = self._solve_softly(f"{name}{origin}", widest, begin, LOOK)
-        self._stiffen(results, harder, [name])
-
-    def alternate_softness(self) -> None:
-        """Soften the cheapest plan's contacts a little, stiffen them, and keep its modes, in turn.
-
-        Softness moves a plan across the switches beside which it ended; descent within its modes ends at an optimum
-        again. The next round begins with this optimum, until a round gains less than `FELL`; at most `ROUNDS` times.
-        """
-        optimum, last = None, [] if self._problem.constraints else self._soft[-AGAIN:]
-        for _ in range(ROUNDS):
-            before = self._cheapest
-            again = self._stiffen({", again": before}, last, [], SOFT) if last else None
-            begin = min(
-                (candidate for candidate in (before, again) if candidate is not None and candidate is not optimum),
-                key=lambda result: result.cost, default=before,
-            )  # fmt: skip
-            if begin is optimum or self._stop.due or not begin.cost < before.cost + NEAR * abs(before.cost):
-                return
-            if not self._keep_modes(begin):
-                return
-            optimum = self._cheapest
-            if not optimum.cost < before.cost - FELL * abs(before.cost):
-                return
-
-    def leave_contact_modes(self) -> None:
-        """If the best plan ended within its contact modes, and one beside it is cheaper, descend out of them."""
-        run, best = self.best
-        contacts = None if best.certificate is None else best.certificate.contacts
-        if contacts is None or not max(contacts.across, contacts.sampled) > run.final:
-            return
-        run = self._add(guess_from(best, "the best plan"), "the best plan, out of its contact modes")
-        result = self._finish(run, refine, most=SOFT)
-        self._offer(run, result, better=self._is_better(result))
-
-    @property
-    def _cheapest(self) -> RunResult:
-        """The cheapest plan, whether it has converged or not; with constraints, the best."""
-        if self._problem.constraints:
-            return self.best[1]
-        finite = [result for _, result in self._finished if np.isfinite(result.cost)]
-        return min(finite, key=lambda result: result.cost, default=self.best[1])
-
-    def _stiffen(
-        self, plans: dict[str, RunResult], soft: Sequence[tuple[str, Problem]], before: list[str],
-        most: int | None = None,
-    ) -> RunResult | None:  # fmt: skip
-        """Continue from these plans for each softness in turn, from fewer at each, and then for the true contacts.
-
-        The plans, by the ends of their names, have passed the softnesses `before`. Returns the plan for the true
-        contacts, after `most` iterations there at most, if that is given; None if no time is left for it.
-        """
-        for name, problem in soft:
-            most_soft = LOOK if len(plans) > 1 else SOFT
-            plans = {
-                origin: self._solve_softly(f"{name}{origin}", problem, guess_from(result, name), most_soft)
-                for origin, result in plans.items()
-                if np.isfinite(result.cost)
-            } or plans
-            if self._stop.due:
-                return None
-            plans = dict(sorted(plans.items(), key=lambda pair: pair[1].cost)[: -(-len(plans) // FEWER)])
-        origin = min(plans, key=lambda origin: plans[origin].cost)
-        run = self._add(guess_from(plans[origin], "a plan for softer contacts"))
-        ended = self._finish(run, refine, most=most)
-        stages = ", ".join([*before, *(name for name, _ in soft)])
-        detail = joined(f"begun with contacts of softness {stages}{origin}", ended.detail)
-        ended = replace(ended, detail=detail)
-        self._offer(run, ended, better=self._is_better(ended))
-        return ended
-
-    def _solve_softly(self, name: str, soft: Problem, begin: Start, most: int) -> RunResult:
-        run = self._another(begin, soft)
-        return self._keep_softer(name, run, self._finish(run, refine, most=most))
-
-    def _keep_softer(self, name: str, run: SolveRun, result: RunResult) -> RunResult:
-        self._softer.append(run.candidate(f"contacts of softness {name}", result))
-        return result
-
-    def _keep_modes(self, plan: RunResult) -> bool:
-        """Continue within the contact modes of a plan, where it may end next to a jump or at a kink, if possible."""
-        from lqrsim.solvers.contact_modes import keep_modes  # this imports MuJoCo, which few problems need
-
-        run = self._another(guess_from(plan, "the best plan"))
-        run.budget.report()
-        result = None
-        # A cost that is not curved in all controls has no descent of this kind.
-        with self._problem.dynamics.solving(self._threads), contextlib.suppress(np.linalg.LinAlgError):
-            result = keep_modes(run, plan)
-        if result is None:
-            return False
-        self._named.append(("the best plan, within its contact modes", run))
-        detail = joined(plan.detail.partition("; ")[0], result.detail)
-        self._offer(run, replace(result, detail=detail), better=result.rank <= self.best[1].rank)
-        return True
+        self.offer(run, result, better=result.rank <= self.best[1].rank)
 
     def _solution(self) -> Solution:
         chosen, result = self.best
-        problem, settings, stop = self._problem, self._settings, self._stop
+        problem, settings, stop = self.problem, self.settings, self.stop
         if not np.isfinite(result.states).all() and not result.success:
             result = replace(result, status=Status.NOT_FINITE, detail=left_domain(problem, result))
         elif result.status is Status.INFEASIBLE and not self.tried and stop.error is None:
@@ -620,123 +450,42 @@ class Search:
         elif self._cut_short and np.isfinite(result.cost):
             untried = "no time was left for further attempts, which may find a better plan"
             result = replace(result, status=Status.TIME_LIMIT, detail=joined(result.detail, untried))
-        elif not stop.due or (self._still is not None and not self._comes_nearer(result)):
-            result = self._with_unmoved_states(result)
-        if result.success and (cheapest := self._cheaper_elsewhere(CHEAPER)) is not None:
-            other = self._unfinished(*self._finished[cheapest])
+        elif not stop.due or (self._approaches.still is not None and not self._approaches.comes_nearer(result)):
+            result = self._approaches.described(result)
+        if result.success and (cheapest := self.cheaper_elsewhere(CHEAPER)) is not None:
+            other = self._unfinished(*self.finished[cheapest])
             result = replace(result, detail=joined(result.detail, other))
-        tolerances = {"tolerance": chosen.final, "constraint_tolerance": self._allowed}
-        begun = self._named[0][1] if settings.start is not None else chosen
+        tolerances = {"tolerance": chosen.final, "constraint_tolerance": self.allowed}
+        begun = self.named[0][1] if settings.start is not None else chosen
         options = settings.options(begun.initial_guess) | tolerances
         return assemble(chosen, result, solver="smooth", options=options, candidates=self._candidates())
 
     def _unfinished(self, run: SolveRun, result: RunResult) -> str:
         """That another plan costs less and has not converged, and how to go on from it; empty for an unnamed one."""
         less = f"a plan that has not converged keeps the constraints and costs less, {result.cost:.6g}"
-        names = (name for name, other in self._named if other is run)
+        names = (name for name, other in self.named if other is run)
         return next((f"{less}: the trajectory of candidate {name!r}, a start to go on from" for name in names), "")
-
-    def _with_unmoved_states(self, result: RunResult) -> RunResult:
-        """The result with the states that miss their goal and that no control changes; STALLED if others would."""
-        problem, places, states = self._problem, self._unmoved(), result.states
-        if not places:
-            return result
-        named = [problem.dynamics.state_coordinates.names[i] for i in places]
-        bodies = dict.fromkeys(filter(None, (problem.dynamics.untouched_body(states, i) for i in places)))
-        said = f"no control changes {' or '.join(named)} along this plan"
-        said += f": nothing that moves touches {' or '.join(bodies)}" if bodies else ""
-        parts = said, self._of_approaches(result, untouched=bool(bodies)), result.detail
-        # If other controls would change one of these states, the plan is on a plateau, and no optimum. They may at any
-        # time, for what sways may come back to the end.
-        gain = np.zeros((problem.steps, len(problem.nominal_control), len(states[0])))
-        sways = (sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2])
-        others = (compiled.rollout(problem, gain, controls, states[0].copy()).states for controls in sways)
-        otherwise = bool(bodies) or any((np.abs(other - states)[:, places] > NONE).any() for other in others)
-        status = Status.STALLED if result.success and otherwise else result.status
-        names = ", ".join(named)
-        remedy = f"leave {names} out of the goal, which no control that was tried changes"
-        if self._nearer is not None:
-            remedy = f"raise the weight of {names} until moving it costs less than leaving it"
-        elif otherwise:
-            clause = "with which the robot touches that body" if problem.dynamics.by_mujoco else f"that change {names}"
-            remedy = f"begin with start=[...], controls {clause}"
-        if self._stop.due:
-            status, remedy = Status.TIME_LIMIT, ""
-        return replace(result, status=status, detail=joined(*parts), remedy=remedy)
-
-    def _of_approaches(self, result: RunResult, *, untouched: bool) -> str:
-        """In words, what came of motions that were to bring states nearer to their goal that a plan does not change."""
-        if self._nearer is not None:
-            name, cost = self._nearer
-            return f"{name} brings it nearer to its goal, at a cost of {cost:.3g} instead of {result.cost:.3g}"
-        if self._approached:
-            tried = ", ".join(dict.fromkeys(self._approached))
-            return f"nothing that was tried brings it nearer to its goal: {tried}"
-        known = "nothing that is driven can collide with it, or it is to turn on the spot"
-        return f"no approach is known: {known}" if self._still is not None and untouched else ""
 
     def _candidates(self) -> tuple[Candidate, ...]:
         """All runs as candidates; none if there was one run."""
-        if len(self._named) == 1:
+        if len(self.named) == 1:
             return ()
-        results = {id(run): result for run, result in self._finished}
-        return (*(run.candidate(name, results.get(id(run))) for name, run in self._named), *self._softer)
-
-    # Helper methods of the steps above.
-
-    def _searched(self, problem: Problem) -> tuple[SolveRun, RunResult]:
-        """The best run of a search for another problem, as far as the choice of a start."""
-        search = Search(problem, self._settings, self._stop, guides(problem, None))
-        with problem.dynamics.solving(search._solving):
-            return search.choose_start()
-
-    def _another(self, start: Start, problem: Problem | None = None) -> SolveRun:
-        """A run from another start, perhaps of another problem."""
-        problem, budget = problem or self._problem, Budget(self._settings.max_iterations, self._stop)
-        return SolveRun(problem, self._settings, resolve(start, problem), self._problem._start_or_zero, budget)
-
-    def _add(self, start: Start, name: str | None = None) -> SolveRun:
-        """A run from another start that is one of the candidates."""
-        run = self._another(start)
-        self._named.append((str(run.initial_guess.summary) if name is None else name, run))
-        return run
-
-    def _finish(
-        self, run: SolveRun, how: Finish = finish, *, most: int | None = None, known: Known | None = None
-    ) -> RunResult:
-        """Run to the end, or `most` iterations more. The callback is called for all iterations of the run so far, too.
-
-        What is known of the search's problem is not known of another.
-        """
-        run.budget.report()
-        known = known or (self._known if run.problem is self._problem else Known())
-        with run.problem.dynamics.solving(self._threads), run.budget.limited(most):
-            return how(run, known)
-
-    def _try(self, name: str, start: Start, how: Finish = finish) -> None:
-        """Finish a run from another start, which is one of the candidates, and record its result."""
-        run = self._add(start, name)
-        self._offer(run, self._finish(run, how))
-
-    def _offer(self, run: SolveRun, result: RunResult, *, better: bool | None = None) -> None:
-        """Record a result; it becomes the best if `better` says so, by default if its rank does."""
-        self._finished.insert(0 if better else len(self._finished), (run, result))
-        if better is None:
-            self._finished.sort(key=lambda pair: pair[1].rank)  # a stable sort: of equal ranks, the first result
+        results = {id(run): result for run, result in self.finished}
+        return (*(run.candidate(name, results.get(id(run))) for name, run in self.named), *self._softening.candidates)
 
     @property
     def may_go_on(self) -> bool:
         """Whether other starts may be tried: by default, as long as there is time."""
-        return self._settings.safeguard and not self._stop.due
+        return self.settings.safeguard and not self.stop.due
 
     @property
     def _cut_short(self) -> bool:
         """Whether other starts or softer contacts may still make a failed plan better, but no time is left for them."""
-        if self.best[1].success or not (self._default and self._settings.safeguard and self._stop.due):
+        if self.best[1].success or not (self._default and self.settings.safeguard and self.stop.due):
             return False
         if not self.tried and self._is_unacceptable:
             return True
-        return bool(self._soft) or any(True for _ in self._problem.dynamics.softened(self.best[1].states))
+        return bool(self._softening.problems) or any(True for _ in self.problem.dynamics.softened(self.best[1].states))
 
     @property
     def is_poor(self) -> bool:
@@ -756,7 +505,7 @@ class Search:
         deeper than half the radius, or half the radius of the largest collision sphere. Without an ObstacleCost, a plan
         is unacceptable if it violates the constraints, or does nothing.
         """
-        problem, space, (run, best) = self._problem, self._problem.dynamics.state_coordinates, self.best
+        problem, space, (run, best) = self.problem, self.problem.dynamics.state_coordinates, self.best
         if not self._guided or problem.goal is None:
             # It does nothing where no single control helps from rest, but several together would.
             nominal = problem.nominal_controls
@@ -778,7 +527,296 @@ class Search:
     @property
     def is_without_plan(self) -> bool:
         """Whether no plan so far keeps the constraints, if there are any."""
-        return bool(self._problem.constraints) and not self.best[1].success
+        return bool(self.problem.constraints) and not self.best[1].success
+
+
+class Approaches:
+    """Motions that change states which miss their goal and which no control changes along the best plan.
+
+    Such a plan is stationary, but says nothing: a box that nothing touches does not move, whatever the weight of its
+    place.
+
+    Attributes:
+      still: the plan along which nothing changes them, and these states; None before the motions were tried.
+      best_nearer: the best plan that brings them nearer to their goal, with the name of its start.
+    """
+
+    still: tuple[RunResult, list[int]] | None = None
+    best_nearer: tuple[str, RunResult] | None = None
+    _cheapest: tuple[str, float] | None = None  # the name and the cost of the cheapest start that brings them nearer
+
+    def __init__(self, runs: Runs) -> None:
+        self._runs, self._problem, self._stop = runs, runs.problem, runs.stop
+        self._unmoved = dict[RunResult, list[int]]()  # by the plan
+        self._tried: list[str] = []  # the approaches
+
+    def push_and_approach(self) -> None:
+        """Begin with pushes by one control at a time, and with approaches to a body that nothing touches."""
+        problem, before, places = self._problem, self._runs.best[1], self.unmoved()
+        self.still = before, places
+        plans = list[tuple[bool, float, str, Start]]()
+
+        def consider(name: str, begin: Start, plan: Motion) -> bool:
+            """Keep a plan that changes these states; return whether it takes them nearer to their goal at less cost."""
+            cost = compiled.cost_of(problem, *plan)
+            if not (np.isfinite(cost) and _differ(plan, before, places)):
+                return False
+            nearer = self.comes_nearer(plan)
+            plans.append((not nearer, cost, name, begin))
+            return nearer and cost < SAVES * before.cost
+
+        for name, controls, plan in multistart.pushes(problem):
+            consider(name, controls, plan)
+        for name, through in _approaches(problem, before, places):
+            if self._stop.due:
+                break
+            drawn = self._runs.result_of(self._runs.another(None, through), refine, most=APPROACH).kept()
+            self._tried.append(name)
+            plan = compiled.rollout(problem, *drawn.law, before.states[0].copy())
+            if consider(name, guess_from(drawn, name), plan):
+                break
+        plans.sort(key=lambda entry: entry[:2])
+        self._cheapest = next(((name, cost) for missed, cost, name, _ in plans if not missed), None)
+        for _, _, name, begin in plans[:PUSHES]:
+            run = self._runs.add(begin, name)
+            with problem.dynamics.solving(self._stop.threads):
+                begun, other = _given(run), self._runs.result_of(run, refine)
+            if other.is_worse(begun, run.work):  # a plan that no step can begin from is left by smoothing
+                status = Status.TIME_LIMIT if self._stop.due else Status.STALLED
+                other = replace(begun, status=status, detail="no step lowers the cost of this plan")
+            self._runs.offer(
+                run, other, better=before.violation >= other.violation and other.cost < self._runs.best[1].cost
+            )
+            if self.comes_nearer(other) and (self.best_nearer is None or other.cost < self.best_nearer[1].cost):
+                self.best_nearer = name, other
+
+    def comes_nearer(self, plan: RunResult | Motion) -> bool:
+        """Whether a plan brings states, which no control changed along the first plan, well nearer to their goal."""
+        if self.still is None or not np.isfinite(plan.states[-1]).all():
+            return False
+        first, places = self.still
+        now, before = (_missing(self._problem, motion.states[-1], places) for motion in (plan, first))
+        return bool(np.linalg.norm(now) < (1 - NEARER) * np.linalg.norm(before))
+
+    @property
+    def left_alone(self) -> bool:
+        """Whether another plan brings them nearer, and the best leaves them alone."""
+        return self.best_nearer is not None and not self.comes_nearer(self._runs.best[1])
+
+    def unmoved(self) -> list[int]:
+        """The states that miss their goal and that no control changes along the best plan."""
+        problem, best = self._problem, self._runs.best[1]
+        if not np.isfinite(best.cost):
+            return []
+        if best in self._unmoved:
+            return self._unmoved[best]
+        states, controls, end, goal = best.states, best.controls, best.states[-1], problem.goal
+        sizes = np.maximum(np.ptp(states, axis=0), 0.0 if goal is None else np.abs(np.nan_to_num(goal - end)))
+        sizes = np.where(sizes > 0, sizes, 1.0)
+        missed = np.abs(_final_cost(problem, end)[1]) * sizes > MOST_OF * abs(best.cost)
+        for i, number in goals_of(problem.constraints, problem.dynamics).items():
+            missed[i] |= abs(end[i] - number) > self._runs.allowed
+        space, places = problem.control_coordinates, np.flatnonzero(missed)
+        span = np.subtract(space.high, space.low)
+        span = np.where(np.isfinite(span), span, np.maximum(np.abs(controls).max(axis=0), 1.0))
+        pull = np.eye(len(end))[places]
+        for state, control in zip(states[-2::-1], controls[::-1], strict=True):
+            if not len(places):
+                break
+            with np.errstate(all="ignore"):
+                a, b, _ = problem.dynamics.linearize(state, control, problem.dt)
+            still = (np.abs(pull @ b) * span).sum(axis=1) <= NONE * sizes[places]
+            places, pull = places[still], (pull @ a)[still]
+        return self._unmoved.setdefault(best, places.tolist())
+
+    def described(self, result: RunResult) -> RunResult:
+        """The result with the states that miss their goal and that no control changes; STALLED if others would."""
+        problem, places, states = self._problem, self.unmoved(), result.states
+        if not places:
+            return result
+        named = [problem.dynamics.state_coordinates.names[i] for i in places]
+        bodies = dict.fromkeys(filter(None, (problem.dynamics.untouched_body(states, i) for i in places)))
+        said = f"no control changes {' or '.join(named)} along this plan"
+        said += f": nothing that moves touches {' or '.join(bodies)}" if bodies else ""
+        parts = said, self._in_words(result, untouched=bool(bodies)), result.detail
+        # If other controls would change one of these states, the plan is on a plateau, and no optimum. They may at any
+        # time, for what sways may come back to the end.
+        gain = np.zeros((problem.steps, len(problem.nominal_control), len(states[0])))
+        sways = (sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2])
+        others = (compiled.rollout(problem, gain, controls, states[0].copy()).states for controls in sways)
+        otherwise = bool(bodies) or any((np.abs(other - states)[:, places] > NONE).any() for other in others)
+        status = Status.STALLED if result.success and otherwise else result.status
+        names = ", ".join(named)
+        remedy = f"leave {names} out of the goal, which no control that was tried changes"
+        if self._cheapest is not None:
+            remedy = f"raise the weight of {names} until moving it costs less than leaving it"
+        elif otherwise:
+            clause = "with which the robot touches that body" if problem.dynamics.by_mujoco else f"that change {names}"
+            remedy = f"begin with start=[...], controls {clause}"
+        if self._stop.due:
+            status, remedy = Status.TIME_LIMIT, ""
+        return replace(result, status=status, detail=joined(*parts), remedy=remedy)
+
+    def _in_words(self, result: RunResult, *, untouched: bool) -> str:
+        """In words, what came of motions that were to bring states nearer to their goal that a plan does not change."""
+        if self._cheapest is not None:
+            name, cost = self._cheapest
+            return f"{name} brings it nearer to its goal, at a cost of {cost:.3g} instead of {result.cost:.3g}"
+        if self._tried:
+            tried = ", ".join(dict.fromkeys(self._tried))
+            return f"nothing that was tried brings it nearer to its goal: {tried}"
+        known = "nothing that is driven can collide with it, or it is to turn on the spot"
+        return f"no approach is known: {known}" if self.still is not None and untouched else ""
+
+
+class Softening:
+    """Plans for softer contacts and limits, and then for the true ones.
+
+    Attributes:
+      candidates: the plans for softer contacts.
+      problems: the problem with contacts of each softness, the widest first; none before plans were made for them.
+    """
+
+    def __init__(self, runs: Runs, approaches: Approaches) -> None:
+        self._runs, self._problem, self._stop, self._approaches = runs, runs.problem, runs.stop, approaches
+        self.candidates: list[Candidate] = []
+        self.problems: list[tuple[str, Problem]] = []
+
+    def soften(self) -> None:
+        """Plan for contacts and limits of decreasing softness, and then for the true ones.
+
+        Each solve begins with the policy of the previous solve, not with its controls: if a contact comes slightly
+        earlier or later, the rest of the plan must not be lost. Which optimum is found depends on where the widest
+        softness begins. So oscillating controls are tried there as well; after two softnesses their costs tell which
+        are good, and a third of the plans goes on at each. Before, a plan that moves a body at last is softened by
+        less: for the softest contacts, it would leave the body alone again.
+        """
+        problem, moved = self._problem, self._approaches.best_nearer
+        begin = self._runs.best[1] if moved is None else moved[1]
+        self.problems = [
+            (name, replace(problem, dynamics=dynamics)) for name, dynamics in problem.dynamics.softened(begin.states)
+        ]
+        if not self.problems:
+            return
+        (name, widest), *harder = self.problems
+        if moved is not None:
+            self._stiffen({f", {moved[0]}": begin}, harder, [])
+            if self._runs.best[1].success or self._stop.due:
+                return
+        results = {"": self._keep_softer(name, *_searched(widest, self._runs))}
+        for cycles, side in itertools.product(SWAYS, (1, -1)):
+            if not self._stop.due:
+                begin, origin = sinusoidal_controls(widest, side * cycles), f", {sinusoidal_name(side * cycles)}"
+                results[origin] = self._solve_softly(f"{name}{origin}", widest, begin, LOOK)
+        self._stiffen(results, harder, [name])
+
+    def alternate(self) -> None:
+        """Soften the cheapest plan's contacts a little, stiffen them, and keep its modes, in turn.
+
+        Softness moves a plan across the switches beside which it ended; descent within its modes ends at an optimum
+        again. The next round begins with this optimum, until a round gains less than `FELL`; at most `ROUNDS` times.
+        """
+        optimum, last = None, [] if self._problem.constraints else self.problems[-AGAIN:]
+        for _ in range(ROUNDS):
+            before = self._cheapest
+            again = self._stiffen({", again": before}, last, [], SOFT) if last else None
+            begin = min(
+                (candidate for candidate in (before, again) if candidate is not None and candidate is not optimum),
+                key=lambda result: result.cost, default=before,
+            )  # fmt: skip
+            if begin is optimum or self._stop.due or not begin.cost < before.cost + NEAR * abs(before.cost):
+                return
+            if not self._keep_modes(begin):
+                return
+            optimum = self._cheapest
+            if not optimum.cost < before.cost - FELL * abs(before.cost):
+                return
+
+    def leave_contact_modes(self) -> None:
+        """If the best plan ended within its contact modes, and one beside it is cheaper, descend out of them."""
+        run, best = self._runs.best
+        contacts = None if best.certificate is None else best.certificate.contacts
+        if contacts is None or not max(contacts.across, contacts.sampled) > run.final:
+            return
+        run = self._runs.add(guess_from(best, "the best plan"), "the best plan, out of its contact modes")
+        result = self._runs.result_of(run, refine, most=SOFT)
+        self._runs.offer(run, result, better=self._is_better(result))
+
+    def _is_better(self, result: RunResult) -> bool:
+        """Whether a plan is better than the best."""
+        best = self._runs.best[1]
+        # Where only one of them moves a body that was out of reach, cost decides: to leave it alone converges easily.
+        if self._approaches.comes_nearer(result) == self._approaches.comes_nearer(best):
+            return result.rank < best.rank
+        return result.violation <= best.violation and result.cost < best.cost
+
+    def _stiffen(
+        self, plans: dict[str, RunResult], soft: Sequence[tuple[str, Problem]], before: list[str],
+        most: int | None = None,
+    ) -> RunResult | None:  # fmt: skip
+        """Continue from these plans for each softness in turn, from fewer at each, and then for the true contacts.
+
+        The plans, by the ends of their names, have passed the softnesses `before`. Returns the plan for the true
+        contacts, after `most` iterations there at most, if that is given; None if no time is left for it.
+        """
+        for name, problem in soft:
+            most_soft = LOOK if len(plans) > 1 else SOFT
+            plans = {
+                origin: self._solve_softly(f"{name}{origin}", problem, guess_from(result, name), most_soft)
+                for origin, result in plans.items()
+                if np.isfinite(result.cost)
+            } or plans
+            if self._stop.due:
+                return None
+            plans = dict(sorted(plans.items(), key=lambda pair: pair[1].cost)[: -(-len(plans) // FEWER)])
+        origin = min(plans, key=lambda origin: plans[origin].cost)
+        run = self._runs.add(guess_from(plans[origin], "a plan for softer contacts"))
+        ended = self._runs.result_of(run, refine, most=most)
+        stages = ", ".join([*before, *(name for name, _ in soft)])
+        detail = joined(f"begun with contacts of softness {stages}{origin}", ended.detail)
+        ended = replace(ended, detail=detail)
+        self._runs.offer(run, ended, better=self._is_better(ended))
+        return ended
+
+    def _solve_softly(self, name: str, soft: Problem, begin: Start, most: int) -> RunResult:
+        run = self._runs.another(begin, soft)
+        return self._keep_softer(name, run, self._runs.result_of(run, refine, most=most))
+
+    def _keep_softer(self, name: str, run: SolveRun, result: RunResult) -> RunResult:
+        self.candidates.append(run.candidate(f"contacts of softness {name}", result))
+        return result
+
+    def _keep_modes(self, plan: RunResult) -> bool:
+        """Continue within the contact modes of a plan, where it may end next to a jump or at a kink, if possible."""
+        from lqrsim.solvers.contact_modes import keep_modes  # this imports MuJoCo, which few problems need
+
+        run = self._runs.another(guess_from(plan, "the best plan"))
+        run.budget.report()
+        result = None
+        # A cost that is not curved in all controls has no descent of this kind.
+        with self._problem.dynamics.solving(self._stop.threads), contextlib.suppress(np.linalg.LinAlgError):
+            result = keep_modes(run, plan)
+        if result is None:
+            return False
+        self._runs.named.append(("the best plan, within its contact modes", run))
+        detail = joined(plan.detail.partition("; ")[0], result.detail)
+        self._runs.offer(run, replace(result, detail=detail), better=result.rank <= self._runs.best[1].rank)
+        return True
+
+    @property
+    def _cheapest(self) -> RunResult:
+        """The cheapest plan, whether it has converged or not; with constraints, the best."""
+        if self._problem.constraints:
+            return self._runs.best[1]
+        finite = [result for _, result in self._runs.finished if np.isfinite(result.cost)]
+        return min(finite, key=lambda result: result.cost, default=self._runs.best[1])
+
+
+def _searched(problem: Problem, runs: Runs) -> tuple[SolveRun, RunResult]:
+    """The best run of a search for another problem than that of these runs, as far as the choice of a start."""
+    search = Search(problem, runs.settings, runs.stop, guides(problem, None))
+    with problem.dynamics.solving(search._solving):
+        return search.choose_start()
 
 
 def _given(run: SolveRun) -> RunResult:
