@@ -543,9 +543,9 @@ class Begun:
         self.source, self.sizes = source_of(iterations), sizes_of(one, form)
 
     def iterate(self, first: int, last: int, **changed: Any) -> tuple[Any, ...]:
-        given = list(self.run._arguments(first, last, self.log))
-        given[3] = given[3]._replace(**changed)
-        return replay(self.source, self.sizes, "smoother", *with_rows(tuple(given)))
+        call = self.run._arguments(first, last, self.log)
+        call = call._replace(settings=call.settings._replace(**changed))
+        return replay(self.source, self.sizes, "smoother", *with_rows(call))
 
     def descend(self, how: Descent, first: int, last: int, **memory: float) -> tuple[Any, ...]:
         if first == 0:
@@ -657,9 +657,8 @@ class TestRareEnds:
     def test_iterations_that_get_nowhere(self) -> None:
         """The plan has converged; with a tolerance of zero it never settles."""
         one = Begun(problem(), max_iterations=20)
-        *given, log = one.run._arguments(0, 19, one.log)
-        given[3] = given[3]._replace(tolerance=0.0)
-        done, outcome, *_ = one.run._loop(*given, log)
+        call = one.run._arguments(0, 19, one.log)
+        done, outcome, *_ = one.run._loop(*call._replace(settings=call.settings._replace(tolerance=0.0)))
         assert outcome == declarations.CYCLING
         one.work.memory["plan_cost"] = 0.0  # or rounding would decide which plan is the best
         assert one.iterate(done, done + 1, tolerance=0.0)[1] == declarations.CYCLING
@@ -739,7 +738,7 @@ class TestRareEnds:
             log["cost"] = costs
             assert replay(source, SIZES, "cycling", with_rows(log), len(log) - 1) == cycling
             assert replay(source, SIZES, "no_progress", with_rows(log), len(log) - 1) == stuck
-        settings = Begun(problem()).run._linearize_arguments(np.zeros(1, LOG))[3]
+        settings = Begun(problem()).run._linearize_arguments(np.zeros(1, LOG)).settings
         settings = settings._replace(tolerance=1e-4, gap_tolerance=1e-3)
         swinging, falling, small = [3e-2, 1e-2, 2e-2] * 4, [1e-1 * 0.8**k for k in range(12)], [1e-4] * 12
         for gaps, change, stuck in (
