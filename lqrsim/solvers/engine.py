@@ -459,7 +459,7 @@ class SolveRun:
                 detail = joined(detail, f"the cost-to-come is left out: {why}")
         return RunResult(
             status=status, detail=detail, plan=work.best, law=law, cost=work.cost,
-            violation=self._violation_of(work.best), gap=gap, values=values,
+            violation=work.violation_of(work.best), gap=gap, values=values,
         )  # fmt: skip
 
     def weigh_noise(self, plan: Motion) -> None:
@@ -526,7 +526,7 @@ class SolveRun:
             nonlocal missed
             ended = self._loop(*arguments(begin, end, rows))
             if ended[0] > begin:
-                missed = self._violation_of(plan)
+                missed = self.work.violation_of(plan)
             return ended
 
         def watch(row: tuple[Any, ...], seconds: float) -> bool:
@@ -595,9 +595,6 @@ class SolveRun:
         )  # fmt: skip
         arrays_ = work.arrays._replace(**arrays)
         return LoopCall(task, begin, end, settings._replace(**options), work.model, arrays_, work.memory_rows, rows)
-
-    def _violation_of(self, plan: Motion) -> float:
-        return self.work.violation(self.work.constraint_values(plan)) if self.problem.constraints else 0.0
 
 
 class Workspace:
@@ -745,6 +742,9 @@ class Workspace:
         """The largest violation of a constraint, given their values; infinite if one is NaN."""
         pairs = zip(self.multipliers, values, strict=True)
         return max((violation_of(multipliers.term, numbers) for multipliers, numbers in pairs), default=0.0)
+
+    def violation_of(self, plan: Motion) -> float:
+        return self.violation(self.constraint_values(plan))
 
     def keeps(self, values: list[Array]) -> bool:
         """Whether a plan with these values keeps all constraints within their tolerance, or at their price."""

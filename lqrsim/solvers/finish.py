@@ -246,7 +246,7 @@ class InteriorRun:
             law = Policy(np.zeros((*plan.controls.shape, plan.states.shape[1])), plan.controls)
         cost, _ = self._run.stages.trial(plan)
         work = self._run.work
-        violation = work.violation(work.constraint_values(plan)) if np.isfinite(plan.states).all() else np.inf
+        violation = work.violation_of(plan) if np.isfinite(plan.states).all() else np.inf
         cost = cost if np.isfinite(cost) else np.inf
         return RunResult(status=Status.MAX_ITERATIONS, plan=plan, law=law, cost=cost, violation=violation)
 

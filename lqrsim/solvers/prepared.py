@@ -401,7 +401,7 @@ class _Finder:
         if not solved and found > rank(self._best.result.plan, self._best.result.cost):
             return replace(self._best.result, status=self._unsolved)
         status = Status.CONVERGED if solved else self._unsolved
-        violation, detail = run.work.violation(run.work.constraint_values(plan)), ""
+        violation, detail = run.work.violation_of(plan), ""
         if violation > run.allowed:
             lagrangian = AugmentedLagrangian(run)
             lagrangian.evaluate(plan)
@@ -432,7 +432,7 @@ class _Best:
         self.result = RunResult(
             status=Status.TIME_LIMIT, plan=copied(last), law=Policy(guess.gain, guess.offset),
             cost=_cost_of(run, self._work.cost, last, self._work.arrays.last_policy),
-            violation=self._work.violation(self._work.constraint_values(last)),
+            violation=self._work.violation_of(last),
             values={"cost_to_go": guess.cost_to_go}, multipliers=guess.multipliers,
         )  # fmt: skip
         self.before, self.improved = self.result.cost, False

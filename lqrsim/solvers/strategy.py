@@ -238,7 +238,7 @@ class Search(Runs):
         self.known.from_start = False
         problem, work, plans = self.problem, self.best[0].work, list[tuple[float, float, Array]]()
         for control, plan in multistart.constant_controls(problem):
-            missed = float(f"{work.violation(work.constraint_values(plan)):.2g}")
+            missed = float(f"{work.violation_of(plan):.2g}")
             cost = compiled.cost_of(problem, *plan)
             if np.isfinite([missed, cost]).all():
                 plans.append((missed, cost, control))
@@ -332,7 +332,7 @@ class Search(Runs):
             run.smooth(multistart.FOLLOW)
             plan = copied(run.work.arrays.last)
             if np.isfinite(plan.states).all():
-                missed = run.work.violation(run.work.constraint_values(plan))
+                missed = run.work.violation_of(plan)
                 motions.append((missed, name, Trajectory(*plan, problem.dt)))
         return [(name, motion) for _, name, motion in sorted(motions, key=lambda motion: motion[0])]
 
