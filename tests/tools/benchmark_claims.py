@@ -22,17 +22,21 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal, get_args
+from unittest.mock import patch
 
 import numpy as np
 from tqdm import tqdm
 
 import lqrsim as ls
 from lqrsim.machine import processors
-from lqrsim.solvers.engine import SolveRun
+from lqrsim.solvers import augmented_lagrangian, finish, strategy
+from lqrsim.solvers.certify import certified
+from lqrsim.solvers.engine import RunResult, SolveRun
 
 sys.path.append(str(Path(__file__).parents[2] / "experiments"))  # has the runner, the systems and the independent judge
 
@@ -194,18 +198,19 @@ def _certificate(config: Config) -> dict[str, Any]:
     problems = [
         replace(problem, initial=ls.FixedState(problem.start)) for problem in problems if problem.start is not None
     ]
-    certified, spent = SolveRun.certified, 0.0
+    spent = 0.0
 
-    def timed(self: SolveRun, found: Any) -> Any:
+    def timed(run: SolveRun, found: RunResult) -> RunResult:
         nonlocal spent
         clock = time.perf_counter()
-        answer = certified(self, found)
+        answer = certified(run, found)
         spent += time.perf_counter() - clock
         return answer
 
     shares: dict[str, list[float]] = {"search": [], "hover": [], "warm": []}
-    SolveRun.certified = timed  # pyright: ignore[reportAttributeAccessIssue]
-    try:
+    with ExitStack() as stack:
+        for module in (augmented_lagrangian, finish, strategy):
+            stack.enter_context(patch.object(module, "certified", timed))
         for problem in tqdm(problems, desc="certificate", leave=False, disable=None):
             solution = ls.smooth(problem, threads=1)
             starts = {"search": None, "hover": problem.nominal_control, "warm": solution.shifted(1)}
@@ -213,8 +218,6 @@ def _certificate(config: Config) -> dict[str, Any]:
                 spent, clock = 0.0, time.perf_counter()
                 ls.smooth(problem, start=start, threads=1)
                 shares[name].append(spent / (time.perf_counter() - clock))
-    finally:
-        SolveRun.certified = certified  # pyright: ignore[reportAttributeAccessIssue]
     return {name: statistics.median(values) for name, values in shares.items()}
 
 
