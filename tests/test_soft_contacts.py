@@ -251,8 +251,8 @@ def test_a_failed_plan_among_contacts_says_that_time_was_over(monkeypatch: pytes
     def run(search: strategy.Search) -> None:
         """As if no step had lowered the cost of the first plan any more."""
         real(search)
-        first, found = search.finished[0]
-        search.finished[0] = first, replace(found, status=ls.Status.STALLED, detail="no step lowers the cost")
+        first, found = search.runs.finished[0]
+        search.runs.finished[0] = first, replace(found, status=ls.Status.STALLED, detail="no step lowers the cost")
 
     monkeypatch.setattr(strategy.Search, "finish_promising", run)
     solution = smoother.solve(problem, replace(options, time_limit=limit))

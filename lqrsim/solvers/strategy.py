@@ -125,7 +125,7 @@ class Runs:
         return int(np.argmin(costs)) if costs.min() < best - less * abs(best) else None
 
 
-class Search(Runs):
+class Search:
     """Runs from several starts, the most promising of which are finished."""
 
     def __init__(
@@ -133,7 +133,7 @@ class Search(Runs):
         starts: Sequence[tuple[str, Start]] = (),
     ) -> None:  # fmt: skip
         """By default from the caller's start, or the usual ones."""
-        super().__init__(problem, settings, stop)
+        self._problem, self._settings, self._stop, self.runs = problem, settings, stop, Runs(problem, settings, stop)
         self._exact = settings.second_order(problem)
         self._guided = multistart.path_weight(problem) > 0  # whether obstacles in the cost push the plan
         self._default = settings.start is None and settings.starts is None  # not by the caller's choice
@@ -143,38 +143,38 @@ class Search(Runs):
                 starts = [(CALLERS_START, resolve(settings.start, problem).penalised(problem, settings.penalty))]
             guesses = [(name, resolve(start, problem)) for name, start in starts or guides(problem, settings.starts)]
             check_functions(problem, guesses[0][1].offset[0].copy())
-            self.named = [(name, self.another(guess)) for name, guess in guesses]
-        self._solving = self.stop.threads if len(self.named) == 1 else 1
-        self._approaches = Approaches(self)
-        self._softening = Softening(self, self._approaches)
+            self.runs.named = [(name, self.runs.another(guess)) for name, guess in guesses]
+        self._solving = self._stop.threads if len(self.runs.named) == 1 else 1
+        self._approaches = Approaches(self.runs)
+        self._softening = Softening(self.runs, self._approaches)
 
     def solve(self, *, trees: bool) -> Solution:
         """The answer after all attempts, no worse than a plan that the caller gave; `trees` if they may grow."""
-        begun = [run for _, run in self.named]
+        begun = [run for _, run in self.runs.named]
         guess = begun[0].initial_guess
-        is_plan = self.settings.start is not None and guess.prior is None and guess.interior is None
+        is_plan = self._settings.start is not None and guess.prior is None and guess.interior is None
         given = _given(begun[0]) if is_plan else None
-        with self.stop.reporting("smooth"):
+        with self._stop.reporting("smooth"):
             # The attempts after this block also solve problems with other dynamics, and set the threads for each.
-            with self.problem.dynamics.solving(self._solving):
+            with self._problem.dynamics.solving(self._solving):
                 self.choose_start()
                 if trees and self.may_go_on and self.is_barred:
                     self.grow_trees()
-                if self.settings.start is None and self._exact and not self._guided:
+                if self._settings.start is None and self._exact and not self._guided:
                     self.try_detours()
                 self.leave_saddles()  # while the best plan is one
             if self._default and self.may_go_on and self._approaches.unmoved():
                 self._approaches.push_and_approach()
-            too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self.named)
-            if self.problem.risk > 0 and too_high and self.may_go_on:
+            too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self.runs.named)
+            if self._problem.risk > 0 and too_high and self.may_go_on:
                 self.retry_without_risk()
-            if self._default and self.may_go_on and (self._approaches.left_alone or not self.best[1].success):
+            if self._default and self.may_go_on and (self._approaches.left_alone or not self.runs.best[1].success):
                 self._softening.soften()
             if given is not None:
                 self.keep_given(given)
-            if not self.best[1].success and self.may_go_on:
+            if not self.runs.best[1].success and self.may_go_on:
                 self._softening.alternate()
-            if not self.best[1].success and self.may_go_on:
+            if not self.runs.best[1].success and self.may_go_on:
                 self._softening.leave_contact_modes()
         solution = self._solution()
         for run in begun:
@@ -184,8 +184,8 @@ class Search(Runs):
     def choose_start(self) -> tuple[SolveRun, RunResult]:
         """Finish the most promising of the given starts, and of others where it leads to a poor plan; the best run."""
         self.finish_promising()
-        lost = not np.isfinite(self.best[1].cost) and self.best[1].status is not Status.RISK_TOO_HIGH
-        if lost and self.problem.start is not None and not self.stop.due:
+        lost = not np.isfinite(self.runs.best[1].cost) and self.runs.best[1].status is not Status.RISK_TOO_HIGH
+        if lost and self._problem.start is not None and not self._stop.due:
             self.try_finite()
         if self.needs_others and self.is_barred:
             self.try_past_constraints()
@@ -195,28 +195,28 @@ class Search(Runs):
             self.try_elsewhere()
         if self.needs_others and not self._guided:
             self.try_sinusoidal_controls()
-        return self.best
+        return self.runs.best
 
     def finish_promising(self) -> None:
         """Finish the most promising run; with constraints, also the others, as long as they may cost less."""
-        problem = self.problem
-        chosen, *others = choose([run for _, run in self.named], self.stop.threads)
+        problem = self._problem
+        chosen, *others = choose([run for _, run in self.runs.named], self._stop.threads)
         driven = 2 * len(problem.control_coordinates) >= len(problem.dynamics.state_coordinates)
         known = problem.start is not None and problem.goal is not None
         # Where exact second derivatives are known, or constraints are to be kept, other methods follow smoothing.
         plain = not problem.constraints and self._default and not self._exact
-        if driven and known and plain and self.settings.safeguard:
+        if driven and known and plain and self._settings.safeguard:
             chosen = self.smooth_or_follow_a_line(chosen)
-        self.offer(chosen, self.result_of(chosen))
+        self.runs.offer(chosen, self.runs.result_of(chosen))
         if not problem.constraints:
             return
         # Constraints can make the best route the worst, or close it. The costs of the other runs so far, without
         # constraints, are approximate lower bounds on their costs with constraints.
         for run in sorted(others, key=lambda run: run.cost):
-            best = self.best[1]
-            if self.stop.due or best.final or (best.success and not run.cost < best.cost):
+            best = self.runs.best[1]
+            if self._stop.due or best.final or (best.success and not run.cost < best.cost):
                 break
-            self.offer(run, self.result_of(run))
+            self.runs.offer(run, self.runs.result_of(run))
 
     def smooth_or_follow_a_line(self, run: SolveRun) -> SolveRun:
         """If smoothing fails for an arm, say, whose every joint has a motor, the run from a line of states, if cheaper.
@@ -224,111 +224,111 @@ class Search(Runs):
         From the controls that hold an arm, the first plans may swing it through itself or the floor, where plans stay.
         """
         run.budget.report()
-        run.smooth(self.settings.max_iterations)
+        run.smooth(self._settings.max_iterations)
         unfinished = Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.RISK_TOO_HIGH
-        if run.ending.success or run.ending.status in unfinished or self.stop.due:
+        if run.ending.success or run.ending.status in unfinished or self._stop.due:
             return run
-        line = self.add(line_of_states(self.problem), "a line of states")
+        line = self.runs.add(line_of_states(self._problem), "a line of states")
         line.budget.report()
-        line.smooth(self.settings.max_iterations)
+        line.smooth(self._settings.max_iterations)
         return line if line.ending.success or line.work.cost < run.work.cost else run
 
     def try_finite(self) -> None:
         """Where states leave their domain, try constant controls under which they do not, and a line of states."""
-        self.known.from_start = False
-        problem, work, plans = self.problem, self.best[0].work, list[tuple[float, float, Array]]()
+        self.runs.known.from_start = False
+        problem, work, plans = self._problem, self.runs.best[0].work, list[tuple[float, float, Array]]()
         for control, plan in multistart.constant_controls(problem):
             missed = float(f"{work.violation_of(plan):.2g}")
             cost = compiled.cost_of(problem, *plan)
             if np.isfinite([missed, cost]).all():
                 plans.append((missed, cost, control))
         for _, _, control in sorted(plans, key=lambda entry: entry[:2])[:CONSTANT]:
-            self.try_from(f"the constant controls {', '.join(f'{u:.3g}' for u in control)}", control)
-            if self.best[1].success or self.stop.due:
+            self.runs.try_from(f"the constant controls {', '.join(f'{u:.3g}' for u in control)}", control)
+            if self.runs.best[1].success or self._stop.due:
                 return
-        if self._exact and not np.isfinite(self.best[1].cost):
-            self.try_from("a line of states", line_of_states(problem), from_states)
+        if self._exact and not np.isfinite(self.runs.best[1].cost):
+            self.runs.try_from("a line of states", line_of_states(problem), from_states)
 
     def try_reweighted(self) -> None:
         """Solve with heavier obstacles, and refine the best of these plans by steps that lower the true cost."""
-        stop = self.stop
+        stop = self._stop
         for times in HEAVIER:
             if stop.due:
                 return
-            heavier = multistart.reweighted(self.problem, times)
-            runs = [self.another(guide, heavier) for _, guide in guides(heavier, None)]
+            heavier = multistart.reweighted(self._problem, times)
+            runs = [self.runs.another(guide, heavier) for _, guide in guides(heavier, None)]
             try:
-                chosen = choose(runs, self.stop.threads)[0]
+                chosen = choose(runs, self._stop.threads)[0]
                 chosen.budget.report()
                 heaviest = chosen.run_to_end()
             except InputError:  # the heavier cost is not finite at the start
                 continue
             if stop.due:
                 return
-            run = self.add(guess_from(heaviest, f"a plan for {times:g} times the weight of obstacles and goal"))
-            result, best = self.result_of(run, refine), self.best[1]
+            run = self.runs.add(guess_from(heaviest, f"a plan for {times:g} times the weight of obstacles and goal"))
+            result, best = self.runs.result_of(run, refine), self.runs.best[1]
             # The same optimum, different within the tolerances, is no improvement.
             lower = not best.success or result.cost < best.cost - 1e-3 * abs(best.cost)
-            self.offer(run, result, better=result.rank < best.rank and lower)
+            self.runs.offer(run, result, better=result.rank < best.rank and lower)
         self.tried = not stop.due
 
     def try_elsewhere(self) -> None:
         """Try other starts until one leads to a plan, before the constraints are called infeasible."""
-        problem = self.problem
+        problem = self._problem
         if self._exact:
             self._follow_ways()
-        motions = dict[str, StartLike](self._motions()) if self._exact and not self.best[1].success else {}
+        motions = dict[str, StartLike](self._motions()) if self._exact and not self.runs.best[1].success else {}
         sways = {sinusoidal_name(cycles): sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]}
         for name, start in (motions | sways).items():
-            if self.stop.due or self.best[1].success:
+            if self._stop.due or self.runs.best[1].success:
                 break
-            self.known.from_start = False
+            self.runs.known.from_start = False
             # A trajectory is on one side of the obstacles; smoothing without the constraints would leave this side. The
             # augmented Lagrangian method stays there only if it begins with the start's own plan.
-            self.try_from(name, start, finish if self._exact and name in sways else refine)
-        self.tried = not self.stop.due
+            self.runs.try_from(name, start, finish if self._exact and name in sways else refine)
+        self.tried = not self._stop.due
 
     def _follow_ways(self) -> None:
         """Begin with ways of states, whatever a rollout does; all of them, because it is not known which is best."""
-        problem = self.problem
-        for way in list(multistart.ways(problem, self.best[0].stages)):
-            if self.stop.due:
+        problem = self._problem
+        for way in list(multistart.ways(problem, self.runs.best[0].stages)):
+            if self._stop.due:
                 return
-            self.known.from_start = False
-            self.try_from(way.name, way.over(problem), from_states)
+            self.runs.known.from_start = False
+            self.runs.try_from(way.name, way.over(problem), from_states)
 
     @property
     def is_barred(self) -> bool:
         """Whether no plan keeps the constraints, some of which may be passed on one side or another."""
-        return self.is_poor and self._exact and self.is_without_plan and any(passable(self.problem))
+        return self.is_poor and self._exact and self.is_without_plan and any(passable(self._problem))
 
     def try_past_constraints(self) -> None:
         """Plan without the constraints that may be passed on one side or another.
 
         A manoeuvre, such as to drive on and back, is found more often where nothing is in the way of its first plans.
         """
-        problem = self.problem
+        problem = self._problem
         pairs = zip(problem.constraints, passable(problem), strict=True)
-        _, best = _searched(problem.with_constraints([one for one, passed in pairs if not passed]), self)
-        if best.success and not self.stop.due:
-            self.known.from_start = False
+        _, best = _searched(problem.with_constraints([one for one, passed in pairs if not passed]), self.runs)
+        if best.success and not self._stop.due:
+            self.runs.known.from_start = False
             name = "a plan without what is in the way"
-            self.try_from(name, guess_from(best, name), refine)
+            self.runs.try_from(name, guess_from(best, name), refine)
 
     def grow_trees(self) -> None:
-        for seed, way in ways_by_trees(self.problem, self.stop):
-            self.try_from(f"trees of short plans, seed {seed}", way, from_states)
-            if self.best[1].success:
+        for seed, way in ways_by_trees(self._problem, self._stop):
+            self.runs.try_from(f"trees of short plans, seed {seed}", way, from_states)
+            if self.runs.best[1].success:
                 return
 
     def _motions(self) -> list[tuple[str, Trajectory]]:
         """Trajectories along paths from start to goal, by name; the least violation of constraints first."""
-        problem, cost = self.problem, self.best[1].cost
+        problem, cost = self._problem, self.runs.best[1].cost
         motions = list[tuple[float, str, Trajectory]]()
         for name, prior in multistart.along_paths(problem, self._steered(), cost if 0 < cost < np.inf else 1.0).items():
-            if self.stop.due:
+            if self._stop.due:
                 break
-            run = self.another(prior)
+            run = self.runs.another(prior)
             run.smooth(multistart.FOLLOW)
             plan = copied(run.work.arrays.last)
             if np.isfinite(plan.states).all():
@@ -338,7 +338,7 @@ class Search(Runs):
 
     def _steered(self) -> list[int]:
         """The states that place the robot: its position, or else states on which constraints to be passed depend."""
-        problem, work, moving = self.problem, self.best[0].work, set[int]()
+        problem, work, moving = self._problem, self.runs.best[0].work, set[int]()
         position = list(problem.dynamics.state_coordinates.position)
         if position or problem.start is None or problem.goal is None:
             return position
@@ -350,23 +350,23 @@ class Search(Runs):
         return sorted(moving)
 
     def try_sinusoidal_controls(self) -> None:
-        runs = [self.another(sinusoidal_controls(self.problem, cycles)) for cycles in SWAYS]
-        chosen = choose(runs, self.stop.threads)[0]
-        self.named.append((sinusoidal_name(SWAYS[runs.index(chosen)]), chosen))
-        result, best = self.result_of(chosen, known=Known()), self.best[1]
+        runs = [self.runs.another(sinusoidal_controls(self._problem, cycles)) for cycles in SWAYS]
+        chosen = choose(runs, self._stop.threads)[0]
+        self.runs.named.append((sinusoidal_name(SWAYS[runs.index(chosen)]), chosen))
+        result, best = self.runs.result_of(chosen, known=Known()), self.runs.best[1]
         # Even a plan that has not converged is better than doing nothing.
-        self.offer(chosen, result, better=result.violation <= best.violation and result.cost < best.cost)
-        self.tried = not self.stop.due
+        self.runs.offer(chosen, result, better=result.violation <= best.violation and result.cost < best.cost)
+        self.tried = not self._stop.due
 
     def try_detours(self) -> None:
         """If the best plan touches a constraint that may be passed on another side, finish plans from such paths."""
-        touched = itertools.compress(self.best[1].multipliers, passable(self.problem))
+        touched = itertools.compress(self.runs.best[1].multipliers, passable(self._problem))
         if not any(multipliers.values.any() for multipliers in touched):
             return
-        tried = {name for name, _ in self.named}
-        for name, trajectory in multistart.detours(self.problem, self.settings.starts).items():
-            if name not in tried and not self.stop.due:
-                self.try_from(name, trajectory)
+        tried = {name for name, _ in self.runs.named}
+        for name, trajectory in multistart.detours(self._problem, self._settings.starts).items():
+            if name not in tried and not self._stop.due:
+                self.runs.try_from(name, trajectory)
 
     def leave_saddles(self) -> None:
         """Go down along a direction of negative curvature, and converge from there, while the best plan is a saddle.
@@ -374,17 +374,17 @@ class Search(Runs):
         A saddle that is not left has not converged, and comes after a plan from elsewhere that costs less.
         """
         for count in range(SADDLES + 1):
-            run, best = self.best
+            run, best = self.runs.best
             if best.certificate is None or best.certificate.curvature is not Curvature.SADDLE:
                 return
             if count == SADDLES or not self._descend(run, best):
-                status = Status.TIME_LIMIT if self.stop.due else Status.STALLED
+                status = Status.TIME_LIMIT if self._stop.due else Status.STALLED
                 detail = "a saddle: the cost falls to second order, but no plan was found beside it that costs less"
                 if count == SADDLES:
                     detail = f"a saddle: the cost falls to second order, as it did at {count} plans that were left"
-                self.finished[0] = run, replace(best, status=status, detail=detail)
-                if (cheapest := self.cheaper_elsewhere(SADDLE_DECREASE)) is not None:
-                    self.finished.insert(0, self.finished.pop(cheapest))
+                self.runs.finished[0] = run, replace(best, status=status, detail=detail)
+                if (cheapest := self.runs.cheaper_elsewhere(SADDLE_DECREASE)) is not None:
+                    self.runs.finished.insert(0, self.runs.finished.pop(cheapest))
                 return
 
     def _descend(self, run: SolveRun, at_saddle: RunResult) -> bool:
@@ -396,52 +396,54 @@ class Search(Runs):
         for size, sign in itertools.product(SADDLE_STEPS, (1, -1)):
             moved = Trajectory(
                 saddle.states + sign * size * direction.states, saddle.controls + sign * size * direction.controls,
-                self.problem.dt,
+                self._problem.dt,
             )  # fmt: skip
-            run_beside = self.another(guess_from(saddle, "a saddle"))
+            run_beside = self.runs.another(guess_from(saddle, "a saddle"))
             run_beside.budget.report()
             result = from_beside(run_beside, moved, saddle)
-            if self.stop.due:
+            if self._stop.due:
                 break
             if result is not None and result.success and result.cost < saddle.cost - SADDLE_DECREASE * abs(saddle.cost):
-                self.named.append(("beside a saddle", run_beside))
-                self.offer(run_beside, result, better=True)
+                self.runs.named.append(("beside a saddle", run_beside))
+                self.runs.offer(run_beside, result, better=True)
                 return True
         return False
 
     def keep_given(self, given: RunResult) -> None:
         """If the best plan is worse than the caller's, or has left what that moved, descend from the caller's plan."""
-        run, best = self.best
+        run, best = self.runs.best
         still = _differ(best, given, self._approaches.unmoved())
-        worsened = still or best.is_worse(given, run.work) or _goal_left(self.problem, best, given)
-        if worsened and not self.stop.due:
-            run = self.add(guess_from(given, "descent from the given plan"))
-            other = self.result_of(run, refine)
+        worsened = still or best.is_worse(given, run.work) or _goal_left(self._problem, best, given)
+        if worsened and not self._stop.due:
+            run = self.runs.add(guess_from(given, "descent from the given plan"))
+            other = self.runs.result_of(run, refine)
             wanted = best.is_worse(given, run.work) or (still and other.cost < best.cost) or other.rank < best.rank
-            self.offer(run, other, better=wanted and not other.is_worse(given, run.work))
-        run, best = self.best
+            self.runs.offer(run, other, better=wanted and not other.is_worse(given, run.work))
+        run, best = self.runs.best
         if best.is_worse(given, run.work):
-            status = Status.TIME_LIMIT if self.stop.due else Status.STALLED
+            status = Status.TIME_LIMIT if self._stop.due else Status.STALLED
             detail = "no plan was found that is better than the given one, which is returned"
-            self.offer(run, replace(given, status=status, detail=detail), better=True)
+            self.runs.offer(run, replace(given, status=status, detail=detail), better=True)
 
     def retry_without_risk(self) -> None:
         """Where the risk was too high for an intermediate plan, solve without risk, and continue from that plan."""
-        riskless = replace(self.problem, risk=0.0)
-        with self.problem.dynamics.solving(self._solving):
-            runs = choose([self.another(run.initial_guess, riskless) for _, run in self.named], self.stop.threads)
-        plan = self.result_of(runs[0])
-        if not plan.success or self.stop.due:
+        riskless = replace(self._problem, risk=0.0)
+        with self._problem.dynamics.solving(self._solving):
+            runs = choose(
+                [self.runs.another(run.initial_guess, riskless) for _, run in self.runs.named], self._stop.threads
+            )
+        plan = self.runs.result_of(runs[0])
+        if not plan.success or self._stop.due:
             return
         begin = guess_from(plan, "a plan without risk")
-        run = self.add(replace(begin, cost_to_go=plan.values["cost_to_go"], multipliers=plan.multipliers))
-        result = self.result_of(run)
+        run = self.runs.add(replace(begin, cost_to_go=plan.values["cost_to_go"], multipliers=plan.multipliers))
+        result = self.runs.result_of(run)
         # Of plans whose risk is too high, this one is near an optimum.
-        self.offer(run, result, better=result.rank <= self.best[1].rank)
+        self.runs.offer(run, result, better=result.rank <= self.runs.best[1].rank)
 
     def _solution(self) -> Solution:
-        chosen, result = self.best
-        problem, settings, stop = self.problem, self.settings, self.stop
+        chosen, result = self.runs.best
+        problem, settings, stop = self._problem, self._settings, self._stop
         if not np.isfinite(result.states).all() and not result.success:
             result = replace(result, status=Status.NOT_FINITE, detail=left_domain(problem, result))
         elif result.status is Status.INFEASIBLE and not self.tried and stop.error is None:
@@ -452,45 +454,50 @@ class Search(Runs):
             result = replace(result, status=Status.TIME_LIMIT, detail=joined(result.detail, untried))
         elif not stop.due or (self._approaches.still is not None and not self._approaches.comes_nearer(result)):
             result = self._approaches.described(result)
-        if result.success and (cheapest := self.cheaper_elsewhere(CHEAPER)) is not None:
-            other = self._unfinished(*self.finished[cheapest])
+        if result.success and (cheapest := self.runs.cheaper_elsewhere(CHEAPER)) is not None:
+            other = self._unfinished(*self.runs.finished[cheapest])
             result = replace(result, detail=joined(result.detail, other))
-        tolerances = {"tolerance": chosen.final, "constraint_tolerance": self.allowed}
-        begun = self.named[0][1] if settings.start is not None else chosen
+        tolerances = {"tolerance": chosen.final, "constraint_tolerance": self.runs.allowed}
+        begun = self.runs.named[0][1] if settings.start is not None else chosen
         options = settings.options(begun.initial_guess) | tolerances
         return assemble(chosen, result, solver="smooth", options=options, candidates=self._candidates())
 
     def _unfinished(self, run: SolveRun, result: RunResult) -> str:
         """That another plan costs less and has not converged, and how to go on from it; empty for an unnamed one."""
         less = f"a plan that has not converged keeps the constraints and costs less, {result.cost:.6g}"
-        names = (name for name, other in self.named if other is run)
+        names = (name for name, other in self.runs.named if other is run)
         return next((f"{less}: the trajectory of candidate {name!r}, a start to go on from" for name in names), "")
 
     def _candidates(self) -> tuple[Candidate, ...]:
         """All runs as candidates; none if there was one run."""
-        if len(self.named) == 1:
+        if len(self.runs.named) == 1:
             return ()
-        results = {id(run): result for run, result in self.finished}
-        return (*(run.candidate(name, results.get(id(run))) for name, run in self.named), *self._softening.candidates)
+        results = {id(run): result for run, result in self.runs.finished}
+        return (
+            *(run.candidate(name, results.get(id(run))) for name, run in self.runs.named),
+            *self._softening.candidates,
+        )
 
     @property
     def may_go_on(self) -> bool:
         """Whether other starts may be tried: by default, as long as there is time."""
-        return self.settings.safeguard and not self.stop.due
+        return self._settings.safeguard and not self._stop.due
 
     @property
     def _cut_short(self) -> bool:
         """Whether other starts or softer contacts may still make a failed plan better, but no time is left for them."""
-        if self.best[1].success or not (self._default and self.settings.safeguard and self.stop.due):
+        if self.runs.best[1].success or not (self._default and self._settings.safeguard and self._stop.due):
             return False
         if not self.tried and self._is_unacceptable:
             return True
-        return bool(self._softening.problems) or any(True for _ in self.problem.dynamics.softened(self.best[1].states))
+        return bool(self._softening.problems) or any(
+            True for _ in self._problem.dynamics.softened(self.runs.best[1].states)
+        )
 
     @property
     def is_poor(self) -> bool:
         """Whether other starts are to be tried. INFEASIBLE is said of the problem, wherever the caller begins."""
-        return self.best[1].status is Status.INFEASIBLE or (self._default and self._is_unacceptable)
+        return self.runs.best[1].status is Status.INFEASIBLE or (self._default and self._is_unacceptable)
 
     @property
     def needs_others(self) -> bool:
@@ -505,7 +512,7 @@ class Search(Runs):
         deeper than half the radius, or half the radius of the largest collision sphere. Without an ObstacleCost, a plan
         is unacceptable if it violates the constraints, or does nothing.
         """
-        problem, space, (run, best) = self.problem, self.problem.dynamics.state_coordinates, self.best
+        problem, space, (run, best) = self._problem, self._problem.dynamics.state_coordinates, self.runs.best
         if not self._guided or problem.goal is None:
             # It does nothing where no single control helps from rest, but several together would.
             nominal = problem.nominal_controls
@@ -527,7 +534,7 @@ class Search(Runs):
     @property
     def is_without_plan(self) -> bool:
         """Whether no plan so far keeps the constraints, if there are any."""
-        return bool(self.problem.constraints) and not self.best[1].success
+        return bool(self._problem.constraints) and not self.runs.best[1].success
 
 
 class Approaches:
