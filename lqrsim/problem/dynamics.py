@@ -95,6 +95,8 @@ class Dynamics:
     by_mujoco: bool = False
     # Relative size of states whose cost is negligible: if the least cost is zero, it is not reached to rounding.
     rounding: float = 1e-13
+    # Hash of the model that MuJoCo steps; empty for functions, which source and parameters define.
+    model_digest: str = ""
     # Runge-Kutta steps in a control period; see `with_substeps`.
     substeps: int = 1
 
@@ -230,11 +232,6 @@ class Dynamics:
     def places(self) -> dict[str, int]:
         """The index of each parameter among the numbers that compiled code takes."""
         return {name: len(self.functions) + i for i, name in enumerate(self.parameters)}
-
-    @property
-    def model_digest(self) -> str:
-        """Hash of the model that MuJoCo steps; empty for functions, which source and parameters define."""
-        return ""
 
     def _functions(self) -> tuple[UserFunction, ...]:
         """The functions that compiled code calls: none if the dynamics are symbolic, else f and the Jacobian, if there

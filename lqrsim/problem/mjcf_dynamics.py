@@ -210,9 +210,8 @@ class MjcfDynamics(Dynamics):
     rounding: float = 1e-7  # MuJoCo iterates for its forces: arms that hold still move by 1e-11
 
     def __init__(
-        self, mjcf: MjcfModel, name: str, *, body: int, obstacles: tuple[int, ...], states: Coordinates,
-        controls: Coordinates,
-    ) -> None:  # fmt: skip
+        self, mjcf: MjcfModel, name: str, *, body: int, obstacles: tuple[int, ...], states: Coordinates
+    ) -> None:
         model = mjcf.model
         refusals = {
             "actuators": (model.nu == 0, "got none", "at least one <actuator> that has a control"),
@@ -225,7 +224,9 @@ class MjcfDynamics(Dynamics):
                 raise InputError(f"{name}: {part}: {got}, want {wanted}")
         self._name, self.physics = name, MjcfPhysics(mjcf, body, obstacles)
         self.functions, self.level = (), "compiled"
-        self.state_coordinates, self.control_coordinates = states, controls
+        names, units, low, high = zip(*mjcf.controls, strict=True)
+        self.state_coordinates = states
+        self.control_coordinates = Coordinates(names=names, units=units, low=low, high=high)
         loads = [f"{model.body(number).name}_load" for number in mjcf.carriers]
         self.parameters: dict[str, float] = {}
         self.disturbances = dict.fromkeys([*WRENCH, *loads], 0.0)
@@ -241,7 +242,7 @@ class MjcfDynamics(Dynamics):
         return self.physics.mjcf
 
     @property
-    def model_digest(self) -> str:
+    def model_digest(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.physics.digest
 
     @property
@@ -262,9 +263,8 @@ class MjcfDynamics(Dynamics):
 
     @property
     def data(self) -> Array:
-        numbers, places = self.physics.numbers.copy(), self.places
-        for name, value in self.parameters.items():
-            numbers[places[name]] = value
+        numbers = self.physics.numbers.copy()
+        numbers[list(self.places.values())] = list(self.parameters.values())
         return numbers
 
     @property

@@ -167,23 +167,14 @@ class MjcfRobot(Robot):
             names=names, units=units, position=dofs, plane=plane, low=low, high=high, rotation_vectors=rotations,
             angles=(*(joint.dof for joint in mjcf.joints if joint.kind == "hinge" and joint.limits is None), *turns),
         )  # fmt: skip
-        self._dynamics = MjcfDynamics(
-            mjcf, who, body=number, obstacles=tuple(geoms), states=states,
-            controls=Coordinates(
-                names=tuple(control.name for control in mjcf.controls) or ("none",),
-                units=tuple(control.unit for control in mjcf.controls) or ("",),
-                low=tuple(control.low for control in mjcf.controls),
-                high=tuple(control.high for control in mjcf.controls),
-            ),
-        )  # fmt: skip
+        self._dynamics = MjcfDynamics(mjcf, who, body=number, obstacles=tuple(geoms), states=states)
         self.radius = reach_of(model, number) if radius is None else radius
 
     @cached_property
     def balls(self) -> MjcfBalls | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        many, model = self._arguments["outline"], self.mjcf.model
-        if many is None:
-            many = not self.dynamics.state_coordinates.position and len(solid_geoms(model)) > 0
-        return MjcfBalls(model) if many else None
+        outline, model = self._arguments["outline"], self.mjcf.model
+        by_default = not self.dynamics.state_coordinates.position and len(solid_geoms(model)) > 0
+        return MjcfBalls(model) if (by_default if outline is None else outline) else None
 
     @cached_property
     def geoms(self) -> CollisionGeoms:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -362,11 +362,10 @@ class MjcfModel:
                 joint.set("name", body)
         changed = len(free) > 1
         for kind, elements in parts.items():
-            names = unnamed_names(kind, used_names)
-            for element in elements:
-                if element.get("name") is None:
-                    element.set("name", next(names))
-                    changed = True
+            unnamed = [element for element in elements if element.get("name") is None]
+            for element, name in zip(unnamed, unnamed_names(kind, used_names), strict=False):
+                element.set("name", name)
+            changed = changed or len(unnamed) > 0
         return self._of(root) if changed else self
 
     def lit(self) -> "MjcfModel":
@@ -375,15 +374,13 @@ class MjcfModel:
         It is compiled only once, with the light at the origin, which is then moved in the text and in the model alike.
         """
         xml, end = self.xml, self.xml.rfind("</mujoco>")
-        worlds = ElementTree.fromstring(xml).iter("worldbody") if "<light" in xml else ()
-        has_light = any(world.find(".//light") is not None for world in worlds)
-        if has_light or end < 0 or ("<attach" in xml and self.model.nlight):
+        if end < 0 or (("<light" in xml or "<attach" in xml) and self.model.nlight):
             return self
 
         def with_light_at(pos: str) -> MjcfModel:
             look = 'dir="0.3 0.3 -1" directional="true" diffuse=".5 .5 .5"'
             added = f'<worldbody><light name="overview" pos="{pos}" {look} /></worldbody>'
-            return replace(self, xml=f"{xml[:end]}{added}{xml[end:]}")  # the text can be long
+            return replace(self, xml=f"{xml[:end]}{added}{xml[end:]}")  # not parsed: it can be long
 
         model = with_light_at("0 0 0").model
         place = model.stat.center + float(model.stat.extent) * np.array([-1.0, -1.0, 3.0])
