@@ -18,7 +18,7 @@ from scipy.stats import binom, chi2
 
 import lqrsim as ls
 from lqrsim.control.offset_free import PLAUSIBLE, RESOLUTION, kalman_filter
-from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.plan_model import PlanDerivatives, PlanModel
 from lqrsim.control.uncertainty import triangular_root
 from lqrsim.disturbances import Uncertainty, Unknown
 from lqrsim.errors import Array
@@ -65,9 +65,9 @@ def conditional(model: PlanModel, inputs: Array, measured: Array, t: int) -> tup
     for i in range(T):
         noise[i * size : (i + 1) * size, i * size : (i + 1) * size] = blocks[i]
         seen = slice(i * model.sensor.size, (i + 1) * model.sensor.size)
-        H[seen, i * size : i * size + model.n] = model.H[i]
-        V[seen, seen] = model.H[i] @ np.diag(model.measurement_std**2) @ model.H[i].T
-        y[seen] = model.H[i] @ (measured[i] - known[i, : model.n])
+        H[seen, i * size : i * size + model.n] = model.derivatives.H[i]
+        V[seen, seen] = model.derivatives.H[i] @ np.diag(model.measurement_std**2) @ model.derivatives.H[i].T
+        y[seen] = model.derivatives.H[i] @ (measured[i] - known[i, : model.n])
     prior = to @ noise @ to.T
     gain = np.linalg.solve(H @ prior @ H.T + V, H @ prior).T
     last = slice(t * size, T * size)
@@ -263,7 +263,7 @@ def test_covariances_stay_positive_without_any_noise() -> None:
     """Sensors without noise make a singular matrix: nothing is less than zero beyond rounding, and nothing is lost."""
     system = linear(np.diag([0.5, -1.0]), [[1.0], [2.0]], [[1.0], [0.0]], controls=np.ones((100, 1)))
     uncertainty = Uncertainty(unknowns=[CONSTANT], start=[1.0, 1e-6], lag=0.05)
-    filtered = kalman_filter(PlanModel(system.problem.dynamics, system.plan, uncertainty))
+    filtered = kalman_filter(PlanModel(PlanDerivatives(system.problem.dynamics, system.plan), uncertainty))
     for covariance in (*filtered.predicted, *filtered.corrected):
         assert np.linalg.eigvalsh(covariance).min() > -1e-14
     # A gentle law: the lag of one that needs it would be taken for less.
@@ -367,10 +367,12 @@ def precisely(model: PlanModel, least: Array, t: int) -> tuple[Any, Any]:
         for i in range(j, t + 1):
             if i > j:
                 reached = exact(model.step.F[i - 1]) * reached
-            seen[i * count : (i + 1) * count, j * size : (j + 1) * size] = exact(model.H[i]) * reached[:n, :]
+            seen[i * count : (i + 1) * count, j * size : (j + 1) * size] = (
+                exact(model.derivatives.H[i]) * reached[:n, :]
+            )
         last[:, j * size : (j + 1) * size] = reached
         noise = (t + 1) * size + j * (n + count)
-        seen[j * count : (j + 1) * count, noise : noise + n] = exact(model.measurement_root[j])
+        seen[j * count : (j + 1) * count, noise : noise + n] = exact((model.derivatives.H * model.measurement_std)[j])
         seen[j * count : (j + 1) * count, noise + n : noise + n + count] = mpmath.diag(list(least[j]))
     gain = last * seen.T * mpmath.inverse(seen * seen.T)
     return last * last.T - gain * seen * last.T, gain[:, t * count : (t + 1) * count]
@@ -386,11 +388,13 @@ def test_exact_and_redundant_sensors_lose_no_digits(name: str, noise: float) -> 
     )
     uncertainty = Uncertainty(unknowns=unknowns, start=[1.0, 1e-3], lag=0.06, measurement=noise, control=1e-2)
     law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, sensors=sensors)
-    bare = PlanModel(system.problem.dynamics, system.plan, uncertainty, law.model.sensor)
+    bare = PlanModel(PlanDerivatives(system.problem.dynamics, system.plan, law.model.sensor), uncertainty)
     for model in (law.model, bare):  # with and without the least errors that OffsetFree assumes
         found, t = kalman_filter(model), model.plan.steps
-        seen = model.H @ found.predicted[:, : model.n, : model.n] @ model.H.transpose(0, 2, 1)
-        variance = np.diagonal(seen, axis1=1, axis2=2) + (model.measurement_root**2).sum(axis=2)
+        seen = model.derivatives.H @ found.predicted[:, : model.n, : model.n] @ model.derivatives.H.transpose(0, 2, 1)
+        variance = np.diagonal(seen, axis1=1, axis2=2) + ((model.derivatives.H * model.measurement_std) ** 2).sum(
+            axis=2
+        )
         with mpmath.workdps(60):
             covariance, gain = (
                 np.array(one.tolist(), dtype=np.float64) for one in precisely(model, RESOLUTION * np.sqrt(variance), t)

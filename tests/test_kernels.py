@@ -36,7 +36,7 @@ from lqrsim.codegen.user_functions import numbers_of
 from lqrsim.control import offset_free, prediction, tracking
 from lqrsim.control.controllers import turning_of
 from lqrsim.control.offset_free import with_filter
-from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.plan_model import PlanDerivatives, PlanModel
 from lqrsim.control.tracking import Weights
 from lqrsim.disturbances import Uncertainty, Unknown
 from lqrsim.errors import Array
@@ -1303,7 +1303,7 @@ class TestDesigns:
             unknowns=[Unknown("d0", 0.7), Unknown("gain of u1", 0.1)], start=0.3, measurement=0.1, control=0.2,
             lag=0.06, command_loss=0.1, loss=0.1,
         )  # fmt: skip
-        model = PlanModel(system.problem.dynamics, system.plan, told)
+        model = PlanModel(PlanDerivatives(system.problem.dynamics, system.plan), told)
         weights = Weights(rng.uniform(1, 2, (2, 3)), np.ones(controls), rng.uniform(1, 2, (2, 3)))
         limits = np.full(controls, -1.0), np.full(controls, 1.5)
 

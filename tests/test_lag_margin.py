@@ -8,7 +8,7 @@ from linear_plans import DT, Linear, by_hand, linear
 from mechanisms import arm
 
 import lqrsim as ls
-from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.plan_model import PlanDerivatives, PlanModel
 from lqrsim.control.prediction import LinearLoop
 from lqrsim.disturbances import MotorLag, Uncertainty, Unknown, preset
 from lqrsim.errors import Array
@@ -94,7 +94,7 @@ def test_moments_with_another_lag_than_the_filters_are_those_of_runs(seed: int, 
     system = joints(seed, steps=12)
     law = ls.OffsetFree(system.problem, system.solution, told_of(LAG), tolerate=0.5, memory=np.inf)
     only = Uncertainty(unknowns=[Unknown("d0", 0.0)], start=SMALL, lag=lag)
-    truth = PlanModel(system.problem.dynamics, system.plan, only)
+    truth = PlanModel(PlanDerivatives(system.problem.dynamics, system.plan), only)
     limits = np.full(2, -1e6), np.full(2, 1e6)
     offset = law.offset - system.plan.controls + np.einsum("tij,tj->ti", law.gain, law.nominal[:-1])
     found = LinearLoop(truth, law.gain, offset, law.filter.gain, limits, law.model).moments()

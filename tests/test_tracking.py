@@ -17,7 +17,7 @@ from sympy import cos, exp, sin
 
 import lqrsim as ls
 from lqrsim.control.offset_free import kalman_filter, with_filter
-from lqrsim.control.plan_model import PlanModel, recursions
+from lqrsim.control.plan_model import PlanDerivatives, PlanModel, recursions
 from lqrsim.control.prediction import LinearLoop
 from lqrsim.control.tracking import Laws, Weights, tracking_laws
 from lqrsim.disturbances import Uncertainty, Unknown
@@ -153,7 +153,7 @@ def test_laws_are_dense_least_squares_of_the_same_cost(structure: int, seed: int
     """Commands of a run that begins anywhere, within 1e-6 of their size: `undo` leaves 1e-9 of its matrix unsolved."""
     system, uncertainty = drawn(structure, seed, unstable=unstable)
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
-    model = PlanModel(system.problem.dynamics, system.plan, uncertainty)
+    model = PlanModel(PlanDerivatives(system.problem.dynamics, system.plan), uncertainty)
     weights = weights_of(rng, n, m, system.plan.steps)
     gain, offset = tracking_laws(model, weights)
     oracle = Oracle(system, uncertainty, weights, persistent=True)
@@ -184,7 +184,7 @@ def test_laws_of_commands_that_get_lost_are_least_squares_over_all_that_may(
     system, uncertainty = drawn(structure, seed, unstable=unstable, steps=steps)
     uncertainty = dataclasses.replace(uncertainty, command_loss=share)
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
-    model = PlanModel(system.problem.dynamics, system.plan, uncertainty)
+    model = PlanModel(PlanDerivatives(system.problem.dynamics, system.plan), uncertainty)
     weights = weights_of(rng, n, m, system.plan.steps)
     gain, offset = tracking_laws(model, weights)
     oracle = Oracle(system, uncertainty, weights, persistent=True)
@@ -216,11 +216,15 @@ def test_moments_of_several_laws_are_those_of_a_plain_recursion(structure: int, 
         uncertainty, command_loss=share, start=0.3, measurement=0.1, control=0.2, model_error=0.05
     )
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
-    model, steps = PlanModel(system.problem.dynamics, system.plan, uncertainty), system.plan.steps
+    model, steps = PlanModel(PlanDerivatives(system.problem.dynamics, system.plan), uncertainty), system.plan.steps
     gain, offset = rng.normal(size=(3, steps, m, n)), rng.normal(size=(3, steps, m))
     limits = np.full(m, -1.0), np.full(m, 1.5)
     found = LinearLoop(model, gain, offset, None, limits).moments(n)
-    shown, (F, G, c), onto_force = np.diag(model.measurement_std**2), model.arriving, np.eye(m, model.size, n)
+    shown, (F, G, c), onto_force = (
+        np.diag(model.measurement_std**2),
+        model.step_with(model.arrived),
+        np.eye(m, model.size, n),
+    )
     for i in range(3):
         x, P = np.zeros(model.size), model.start_root @ model.start_root.T
         for t in range(steps + 1):
@@ -259,7 +263,7 @@ def test_choosing_predicts_the_moments_of_the_whole_recursion(structure: int, se
     system, uncertainty = drawn(structure, seed, unstable=False)
     uncertainty = dataclasses.replace(uncertainty, start=0.3, measurement=0.1, control=0.2, model_error=0.05)
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
-    model, steps = PlanModel(system.problem.dynamics, system.plan, uncertainty), system.plan.steps
+    model, steps = PlanModel(PlanDerivatives(system.problem.dynamics, system.plan), uncertainty), system.plan.steps
     laws = Laws(rng.normal(size=(3, steps, m, model.size)), rng.normal(size=(3, steps, m)))
     bounds = (np.full(m, -1.0), np.full(m, 1.5)) if limits else (np.full(m, -np.inf), np.full(m, np.inf))
     filtered = kalman_filter(model)
@@ -277,7 +281,7 @@ def test_moments_of_commands_that_get_lost_are_those_of_all_patterns(structure: 
     system, uncertainty = drawn(structure, seed, unstable=False, steps=steps)
     uncertainty = dataclasses.replace(uncertainty, command_loss=share, start=0.3, unknowns=())
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
-    model = PlanModel(system.problem.dynamics, system.plan, uncertainty)
+    model = PlanModel(PlanDerivatives(system.problem.dynamics, system.plan), uncertainty)
     gain, offset, no = rng.normal(size=(steps, m, n)), rng.normal(size=(steps, m)), np.zeros(0)
     moments = LinearLoop(model, gain, offset, None, (np.full(m, -np.inf), np.full(m, np.inf))).moments()
     oracle = Oracle(system, uncertainty, Weights(np.ones(n), np.ones(m), np.ones(n)))
@@ -309,7 +313,7 @@ def test_the_linear_model_is_the_run(structure: int, seed: int, unstable: bool) 
     """F, G and c against the oracle's run, which is stated as absolute numbers: 1e-9."""
     system, uncertainty = drawn(structure, seed, unstable=unstable)
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
-    model = PlanModel(system.problem.dynamics, system.plan, uncertainty)
+    model = PlanModel(PlanDerivatives(system.problem.dynamics, system.plan), uncertainty)
     oracle = Oracle(system, uncertainty, Weights(np.ones(n), np.ones(m), np.ones(n)))
     e, a, d = rng.normal(size=n), rng.normal(size=m), rng.normal(size=oracle.states_of_unknowns)
     changes = rng.normal(size=(system.plan.steps, m))
@@ -333,7 +337,7 @@ def test_they_are_the_same_in_any_units_of_the_controls(seed: int, unstable: boo
     )  # fmt: skip
     weights, laws = weights_of(np.random.default_rng(seed + 1), 3, 2, usual.plan.steps), []
     for system, unit in ((usual, np.ones(2)), (other, units)):
-        model = PlanModel(system.problem.dynamics, system.plan, uncertainty)
+        model = PlanModel(PlanDerivatives(system.problem.dynamics, system.plan), uncertainty)
         gain, offset = tracking_laws(model, dataclasses.replace(weights, control=weights.control * unit**2))
         entries = np.ones(model.size)
         entries[3:5] = unit  # what the actuators have reached
@@ -359,7 +363,7 @@ def test_effects_of_a_parameter_are_its_derivatives_whatever_its_size(exponent: 
     for torque in controls:
         states.append(dynamics.step(states[-1], torque, DT))
     plan = ls.Trajectory(np.array(states), controls, DT)
-    model = PlanModel(dynamics, plan, Uncertainty(unknowns=[Unknown("inertia", 0.1 * inertia)]))
+    model = PlanModel(PlanDerivatives(dynamics, plan), Uncertainty(unknowns=[Unknown("inertia", 0.1 * inertia)]))
     wanted = -(1.5 + control) / inertia * np.array([DT**2 / 2, DT])
     np.testing.assert_allclose(model.effects[:, :, 0], np.tile(wanted, (4, 1)), rtol=1e-4)
 

@@ -15,7 +15,7 @@ from scipy.stats import binomtest, multivariate_normal, norm
 
 import lqrsim as ls
 from lqrsim.control.controllers import Feedback
-from lqrsim.control.plan_model import PlanModel, recursions
+from lqrsim.control.plan_model import PlanDerivatives, PlanModel, recursions
 from lqrsim.control.prediction import DeviationNorm, LinearLoop, SampledLoop, Surroundings, both_below, sample_loop
 from lqrsim.disturbances import Uncertainty
 from lqrsim.errors import Array
@@ -314,7 +314,7 @@ def test_sampled_moments_of_a_linear_system_are_those_of_its_matrices(estimates:
     else:
         tolerate = {"s0": 0.1, "s1": 0.5}
         policy = ls.track(system.problem, system.solution, tolerate=tolerate, effort=0.5, uncertainty=stated)
-        controller, model = Feedback(policy), PlanModel(system.problem.dynamics, system.plan, stated)
+        controller, model = Feedback(policy), PlanModel(PlanDerivatives(system.problem.dynamics, system.plan), stated)
         offset = np.einsum("tij,tj->ti", policy.gain, system.plan.states[:-1]) + policy.offset - system.plan.controls
         loop = LinearLoop(model, policy.gain, offset, None, (np.full(1, -1e6), np.full(1, 1e6)))
     moments, n = loop.moments(), loop.model.n
@@ -455,7 +455,9 @@ def test_effects_are_those_of_finite_differences(quadrotor: ls.Scenario) -> None
         states.append(dynamics.step(states[-1], control, dt))
     plan = ls.Trajectory(np.array(states), controls, dt)
     names = ["wind_x", "force_z", "torque_y", "mass", "gain of rotor_2", "offset of rotor_3"]
-    model = PlanModel(dynamics, plan, Uncertainty(unknowns=[ls.disturbances.Unknown(name, 1.0) for name in names]))
+    model = PlanModel(
+        PlanDerivatives(dynamics, plan), Uncertainty(unknowns=[ls.disturbances.Unknown(name, 1.0) for name in names])
+    )
     h = 1e-4
     for t in range(3):
         for i, name in enumerate(names):
@@ -469,7 +471,7 @@ def test_effects_are_those_of_finite_differences(quadrotor: ls.Scenario) -> None
                 else:
                     told = told.with_parameters(**{name: told.parameters[name] + change})
                 ends.append(told.step(plan.states[t], u, dt))
-            np.testing.assert_allclose(model.E[t, :, i], (ends[0] - ends[1]) / (2 * h), rtol=0, atol=1e-6)
+            np.testing.assert_allclose(model.step.F[t, :12, 12 + i], (ends[0] - ends[1]) / (2 * h), rtol=0, atol=1e-6)
 
 
 def test_a_system_without_the_parameter_has_another_law() -> None:

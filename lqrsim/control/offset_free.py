@@ -26,7 +26,7 @@ import numpy.typing as npt
 from lqrsim.annotations import checked
 from lqrsim.codegen.compiled_module import in_c_order
 from lqrsim.control.controllers import Controller, ControllerRun, check_plan, turn_to_nearest, turning_of
-from lqrsim.control.plan_model import STEP, PlanModel, Sensors, recursions, sensor_of
+from lqrsim.control.plan_model import STEP, Lag, PlanDerivatives, PlanModel, Sensors, recursions, sensor_of
 from lqrsim.control.prediction import LinearLoop, moments_of
 from lqrsim.control.replanner import ReplanLog, ReplanRule, SolveRequest
 from lqrsim.control.tracking import (
@@ -40,7 +40,7 @@ from lqrsim.control.tracking import (
     tolerances_to_try,
     tracking_laws,
 )
-from lqrsim.control.uncertainty import Uncertainty, check_seconds, per_entry, triangular_root
+from lqrsim.control.uncertainty import OFFSET, Uncertainty, Unknown, check_seconds, per_entry, triangular_root
 from lqrsim.errors import Array, InputError, check_kind
 from lqrsim.kernels.feedback import FAR
 from lqrsim.kernels.records import (
@@ -74,6 +74,14 @@ LEAST_STD = 1e-150  # the same, absolute, if the prediction is certain: its squa
 # doubles with each measurement that exceeds it. A validation gate, which rejects such measurements, could reject a
 # parameter that is far from its stated value for ever.
 PLAUSIBLE = 6.0
+# The least errors that a filter assumes, relative to the tolerated effort: in each control, and in each state's
+# prediction, as if this effort had moved the state. A model is never exact: disturbances do not act evenly over a
+# control period, integration has errors, and the gains are computed about the plan. With exact sensors, a filter
+# without this assumption would infer unknowns from the last digits of its prediction errors.
+INEXACT = 0.02
+# The assumed difference between the command in force and the lost command, relative to the tolerated effort. This value
+# is our choice: up to a loss of one half, nothing between 0.3 and 1 does better.
+STALE = 0.3
 # A reading does not depend on the state if its derivatives are below this: differences of MuJoCo's are good to 1e-9.
 _SILENT = 1e-8
 _WRENCH = tuple(f"{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
@@ -86,10 +94,32 @@ WITHOUT_LAG = 0.3
 # 0.1, or as a tube of six times the width.
 MUCH_WORSE = 0.1
 # What the filters of milder designs assume: a fraction of the stated lag; and noise on the controls that bypasses the
-# actuators, as in `PlanModel.assumed`.
+# actuators; see `assumed_model`.
 MILDER = ((1.0, 0.05), (1.0, 0.2), (0.75, 0.2), (0.5, 0.2))
 WIDEST = 1.25  # the largest width of the chosen tube with the lag, relative to the narrowest of all designs
 WORST = (1.0, 1e30, 1.0)  # the `Predictions` for a loop whose moments are not finite
+
+
+def assumed_model(
+    derivatives: PlanDerivatives, stated: Uncertainty, memory: float, effort: Array, bypass: float = 0.0
+) -> PlanModel:
+    """The model that a filter assumes, with a memory in s: see `Uncertainty.steady`. Nothing is exact.
+
+    `bypass` is noise on controls that bypasses the actuators, relative to effort times `Lag.mean`: `robust_to_lag`.
+    """
+    space, controls = derivatives.dynamics.state_coordinates, derivatives.dynamics.control_coordinates
+    steady, moved, lost = stated.steady(memory), derivatives.reach(effort, [2])[0], stated.command_loss
+    control = per_entry("Uncertainty: control", stated.control, controls)
+    control = np.hypot(control, np.sqrt(lost * (1 - lost)) * STALE * effort)  # the filter expects the mean
+    error = per_entry("Uncertainty: model_error", stated.model_error, space)
+    behind = zip(controls.names, bypass * Lag.of(stated.lag, derivatives.plan.dt).mean * effort, strict=True)
+    directly = [Unknown(OFFSET + name, float(std), time_constant=0.0) for name, std in behind if std]
+    assumed = replace(
+        steady, unknowns=(*steady.unknowns, *directly),
+        control=tuple(np.maximum(control, INEXACT * effort).tolist()),
+        model_error=tuple(np.maximum(error, INEXACT * moved).tolist()),
+    )  # fmt: skip
+    return PlanModel(derivatives, assumed)
 
 
 class KalmanFilter(NamedTuple):
@@ -111,14 +141,15 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
         earlier plan has used that measurement; the gain there is then zero. By default the filter begins before that
         measurement, with the model's `start_root`.
     """
-    size, measured, n, disturbing = model.size, model.sensor.size, model.n, model.disturbing
+    size, n, H, disturbing = model.size, model.n, model.derivatives.H, model.disturbing
+    measured = model.sensor.size
     sizes = FilterSizes(
         model.plan.steps + 1, size, measured, n, disturbing.shape[2], known is not None, RESOLUTION, LEAST_STD
     )
     work = np.empty(max((measured + size) * (n + measured + size), size * (size + disturbing.shape[2])))
     arrays = {"root": np.array(model.start_root if known is None else known, order="C"), "work": work}
     roots = zeros_of(FilterRoots, arrays, T=model.plan.steps, Z=size, Y=measured)
-    system = FilterModel(*map(np.ravel, (model.step.F, model.H, model.measurement_root, disturbing)))
+    system = FilterModel(*map(np.ravel, (model.step.F, H, H * model.measurement_std, disturbing)))
     recursions().filter_along(sizes, system, FilterRoots(*map(np.ravel, roots)))
     _, before, after, innovation_root, correction_root, _ = roots
     limit = PLAUSIBLE * np.sqrt((correction_root[:, n + model.lagging :] ** 2).sum(axis=2))
@@ -141,11 +172,15 @@ def _gains(correction_root: Array, root: Array) -> Array:
 def check_observable(model: PlanModel) -> None:
     """Raise InputError that names an unknown, if it moves the robot but changes no measurement of the plan's model."""
     first = model.n + model.lagging
-    effect, groups = np.eye(model.size)[:, first:], [list(indices) for indices in model.unknown_states]
+    H, effect, groups = (
+        model.derivatives.H,
+        np.eye(model.size)[:, first:],
+        [list(indices) for indices in model.unknown_states],
+    )
     moved, seen = np.zeros(model.size - first), np.zeros(model.size - first)
     for t in range(model.plan.steps + 1):
         moved = np.maximum(moved, np.abs(effect[: model.n]).max(axis=0, initial=0.0))
-        seen = np.maximum(seen, np.abs(model.H[t] @ effect[: model.n]).max(axis=0, initial=0.0))
+        seen = np.maximum(seen, np.abs(H[t] @ effect[: model.n]).max(axis=0, initial=0.0))
         if all(seen[group].any() for group in groups):
             return
         if t < model.plan.steps:
@@ -427,8 +462,8 @@ class FilterRun(ControllerRun):
         self._last_measured[:] = measured
         model.compiled.correct(
             self._trials, in_c_order(measured), lost, in_c_order(law.model.plan.states[knot]),
-            law.filter.gain[knot], law.filter.limit[knot], self._limit_factors, model.compiled_sensor, self._turning,
-            self.z, self._innovation,
+            law.filter.gain[knot], law.filter.limit[knot], self._limit_factors, model.derivatives.compiled_sensor,
+            self._turning, self.z, self._innovation,
         )  # fmt: skip
         at = step - self._latency
         if self.estimates is not None and self.innovations is not None and at < len(self.estimates):
@@ -608,7 +643,7 @@ class ReplannedRun(ControllerRun):
         if not self.log.record(step, trial, solution):
             return
         self.plans[trial][step] = solution.trajectory
-        about = PlanModel(dynamics, solution.trajectory, model.uncertainty, model.sensor)
+        about = PlanModel(PlanDerivatives(dynamics, solution.trajectory, model.sensor), model.uncertainty)
         # The filter begins with a measurement that has been used already.
         kalman = kalman_filter(about, law.filter.corrected_root[done])
         weights = replace(law.weights, emphasis=None)  # that of another plan
@@ -691,8 +726,9 @@ class OffsetFree(Controller):
         of_mjcf, of_states = (sensors, None) if isinstance(sensors, RobotSensors) else (None, sensors)
         sensor = sensor_of(of_states, problem.dynamics.state_coordinates)
         efforts = effort_of(effort, problem.dynamics)
-        stated = PlanModel(problem.dynamics, plan, uncertainty, sensor)
-        self.model = stated.assumed(memory, efforts)
+        uncertainty.check(problem.dynamics)
+        derivatives = PlanDerivatives(problem.dynamics, plan, sensor)
+        self.model = assumed_model(derivatives, uncertainty, memory, efforts)
         check_observable(self.model)
         self._rule = None if replan_every is None else self._replan_rule(replan_every)
         self._sensing = None if of_mjcf is None else self._sensor_filter(of_mjcf, replan_every)
@@ -706,7 +742,7 @@ class OffsetFree(Controller):
             laws = tracking_laws(self.model, weights)
         law = FilterLaw(solution, self.model, self.filter, weights, laws)
         if uncertainty.lag > 0 and memory < np.inf and self._sensing is None:
-            law = robust_to_lag(judge, stated, law, memory, efforts, at_end if tolerate is None else None)
+            law = robust_to_lag(judge, uncertainty, law, memory, efforts, at_end if tolerate is None else None)
         self._law, self.model, self.filter, self.weights = law, law.model, law.filter, law.weights
         self.gain, self.offset, self.nominal = law.gain, law.offset, law.nominal
 
@@ -767,7 +803,7 @@ class OffsetFree(Controller):
         stated = self.uncertainty if uncertainty is None else uncertainty
         check_kind("uncertainty", stated, Uncertainty, "an Uncertainty, such as uncertainty_of(...), or None")
         stated.check(self.problem.dynamics)
-        truth = self.model.under(stated.steady(np.inf))
+        truth = PlanModel(self.model.derivatives, stated.steady(np.inf))
         offset = self.offset - self.solution.trajectory.controls
         offset = offset + np.einsum("tij,tj->ti", self.gain, self.nominal[:-1])
         return LinearLoop(truth, self.gain, offset, self.filter.gain, self.coordinates[1].limits, self.model)
@@ -828,7 +864,7 @@ def with_filter(model: PlanModel, kalman: KalmanFilter, limits: tuple[Array, Arr
 
 
 def robust_to_lag(
-    judge: Judge, stated: PlanModel, design: FilterLaw, memory: float, effort: Array, at_end: float | None
+    judge: Judge, stated: Uncertainty, design: FilterLaw, memory: float, effort: Array, at_end: float | None
 ) -> FilterLaw:
     """The design, or a milder one if the design is much worse without the lag.
 
@@ -843,20 +879,20 @@ def robust_to_lag(
     little choice: without it the robot stays near its plan, but may miss its goal.
 
     Args:
-      stated: model of the true system, with the stated lag. memory, effort: as in `PlanModel.assumed`.
+      stated: the true uncertainty, with the stated lag. memory, effort: as in `assumed_model`.
       at_end: as in `tolerances_to_try`, whose tolerances compete; None to keep those of the design.
     """
-    solution, uncertainty = judge.solution, stated.uncertainty.steady(np.inf)
+    solution, derivatives, uncertainty = judge.solution, design.model.derivatives, stated.steady(np.inf)
     # Without losses of commands, a model without a lag has no actuators' states. One with the shortest lag has them.
     no_lag = 0.0 if uncertainty.command_loss else np.finfo(np.float64).tiny
-    systems = [stated.under(replace(uncertainty, lag=lag)) for lag in (uncertainty.lag, no_lag)]
+    systems = [PlanModel(derivatives, replace(uncertainty, lag=lag)) for lag in (uncertainty.lag, no_lag)]
 
     def predicted(design: FilterLaw) -> Predictions:
         """The predictions for C laws, (2, C): with the lag, and without it."""
         limits = solution.policy.control_coordinates.limits
         loop = LinearLoop(systems[0], *design.laws, design.filter.gain, limits, design.model)
         with np.errstate(over="ignore", invalid="ignore"):  # loops that are not stable
-            moments = loop.in_systems(systems, stated.n)
+            moments = loop.in_systems(systems, derivatives.n)
             lost = np.asarray(~np.isfinite(moments.covariance).all(axis=(-3, -2, -1)))
         for moment in moments:
             moment[lost] = 0.0
@@ -871,8 +907,7 @@ def robust_to_lag(
     weights = design.weights.pick(None) if kept else tolerances_to_try(design.model, effort, at_end, solution)
     designs = [replace(design, weights=weights, laws=tracking_laws(design.model, weights))]
     for fraction, bypass in MILDER:
-        partly = stated.under(replace(stated.uncertainty, lag=fraction * stated.uncertainty.lag))
-        model = partly.assumed(memory, effort, bypass)
+        model = assumed_model(derivatives, replace(stated, lag=fraction * stated.lag), memory, effort, bypass)
         designs.append(FilterLaw(solution, model, kalman_filter(model), weights, tracking_laws(model, weights)))
     outcomes = [predicted(candidate) for candidate in designs]
     widths = np.array([outcome.width[0] for outcome in outcomes])
@@ -889,20 +924,20 @@ def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
     Commands under way are part of the state, and advance by one place in each period. If measurements are late by k
     periods, z is k periods behind, and the law acts on the prediction of z with the commands since, which is linear.
     """
-    model, plan = law.model, law.model.plan
+    model, along, plan = law.model, law.model.derivatives, law.model.plan
     steps, m, latency, delay = plan.steps, model.m, model.uncertainty.latency, model.uncertainty.delay
     size, width = model.size, model.size + (latency + delay) * m
     (F, G, c), nominal = model.step, law.nominal
     f = nominal[1:] + c - np.einsum("tij,tj->ti", F, nominal[:-1]) - np.einsum("tij,tj->ti", G, plan.controls)
     measured = np.empty((steps + 1, model.sensor.size))  # h of y = H x + h
-    model.compiled.measurements(len(measured), in_c_order(plan.states), model.compiled_sensor, measured)
-    measured -= np.einsum("tij,tj->ti", model.H, plan.states)
+    along.compiled.measurements(len(measured), in_c_order(plan.states), along.compiled_sensor, measured)
+    measured -= np.einsum("tij,tj->ti", along.H, plan.states)
     knots = np.maximum(np.arange(steps) - latency, 0)  # of z
     sent = np.clip(np.arange(steps)[:, None] + delay - np.arange(latency + delay, 0, -1), 0, steps - 1)
     arrays = {
         "gain": np.empty((steps, m, width)), "offset": np.empty((steps, m)),
         "correction": np.zeros((steps, width, model.sensor.size)),
-        "sensor": model.H[knots], "sensor_offset": measured[knots],
+        "sensor": along.H[knots], "sensor_offset": measured[knots],
         "transition": np.zeros((steps, width, width)), "input": np.zeros((steps, width, m)),
         "drift": np.zeros((steps, width)),
         "nominal": np.concatenate([nominal[knots], plan.controls[sent].reshape(steps, -1)], axis=1),

@@ -12,7 +12,7 @@ actuators stay as they are.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -28,7 +28,7 @@ from lqrsim.control.uncertainty import GAIN, OFFSET, Uncertainty, Unknown, per_e
 from lqrsim.errors import Array, InputError, check_array, check_items, check_name, excerpt
 from lqrsim.kernels import feedback
 from lqrsim.kernels import recursions as recursion_kernels
-from lqrsim.kernels.records import Predictor, SensorModel
+from lqrsim.kernels.records import DynamicsModel, Predictor, SensorModel
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.solution_parts import Trajectory
@@ -98,16 +98,8 @@ def _symbolic(function: Callable[[Any, Any, Any], Any], states: Sequence[str]) -
     return Sensor(text_source(str(written["source"]), of), np.zeros(1), size, tuple(f"{of}[{i}]" for i in range(size)))
 
 
-# The least errors that a filter assumes, relative to the tolerated effort: in each control, and in each state's
-# prediction, as if this effort had moved the state. A model is never exact: disturbances do not act evenly over a
-# control period, integration has errors, and the gains are computed about the plan. With exact sensors, a filter
-# without this assumption would infer unknowns from the last digits of its prediction errors.
-INEXACT = 0.02
-# The assumed difference between the command in force and the lost command, relative to the tolerated effort. This value
-# is our choice: up to a loss of one half, nothing between 0.3 and 1 does better.
-STALE = 0.3
-# The step of differences by a parameter p is STEP max(1, |p|), but at most OF_SMALL |p|, for a moment of inertia may be
-# 1e-5 kg m^2. This cap is at least LEAST_STEP, below which rounding dominates.
+# Step of a parameter for differences, relative to its value if that is larger than 1; and the largest relative to a
+# small value, such as a moment of inertia of 1e-5 kg m^2, unless the step is then one of rounding.
 STEP, OF_SMALL, LEAST_STEP = 1e-5, 1e-3, 1e-10
 
 
@@ -126,102 +118,31 @@ class Lag:
         return cls(float(np.exp(-step)), float(-np.expm1(-step) / step))
 
 
-class LinearSteps(NamedTuple):
-    """The linear model of all steps."""
-
-    F: Array  # (T, Z, Z)
-    G: Array  # (T, Z, m)
-    c: Array  # (T, Z)
-
-
-class PlanModel:
-    """A plan and its uncertainty, linearised.
+class PlanDerivatives:
+    """A system linearised along a plan, whatever the uncertainty: its steps, and what the sensors measure.
 
     Attributes:
-      n, m: numbers of states and of controls. lagging: number of entries of z for the actuators. size: of z.
-      lag: the lag, as a mean over commands that arrive and commands that get lost.
-      parameters: the parameters of the dynamics that are unknown.
-      remembered: the unknowns that have states. unknown_states: for each of these, the indices of its states.
-      transition: transition matrix of the unknowns' states, (D, D).
-      output: from these to values of the parameters, and the gain and the offset of each control, (P + 2 m, D).
-      measurement_std: standard deviation of the noise on each measured state, (n,).
+      dynamics: the system, with disturbances as parameters. n, m: numbers of states and of controls.
     """
 
-    def __init__(
-        self, dynamics: Dynamics, plan: Trajectory, uncertainty: Uncertainty, sensor: Sensor | None = None
-    ) -> None:
-        uncertainty.check(dynamics)
-        self.dynamics, self.plan, self.uncertainty = dynamics.disturbed, plan, uncertainty
+    def __init__(self, dynamics: Dynamics, plan: Trajectory, sensor: Sensor | None = None) -> None:
+        self.dynamics, self.plan = dynamics.disturbed, plan
         self.sensor = sensor or sensor_of(None, dynamics.state_coordinates)
         self.n, self.m = plan.states.shape[1], plan.controls.shape[1]
-        lost, arrived = uncertainty.command_loss, Lag.of(uncertainty.lag, plan.dt)
-        self.lagging = self.m if uncertainty.lag > 0 or lost > 0 else 0
-        self.lag = Lag(lost + (1 - lost) * arrived.left, lost + (1 - lost) * arrived.mean)
-        named = dict.fromkeys(name for unknown in uncertainty.unknowns for name in unknown.shares)
-        self.parameters = tuple(name for name in named if name in self.dynamics.parameters)
-        self.remembered = tuple(unknown for unknown in uncertainty.unknowns if not unknown.white)
-        self._filters = [shaping_filter(unknown, plan.dt) for unknown in self.remembered]
-        ends = np.cumsum([0, *(len(shaping.output) for shaping in self._filters)])
-        self.unknown_states = [range(first, end) for first, end in pairwise(ends.tolist())]
-        self.transition = _diagonal([shaping.transition for shaping in self._filters])
-        columns = [
-            self._weights(unknown)[:, None] * shaping.output
-            for unknown, shaping in zip(self.remembered, self._filters, strict=True)
-        ]
-        self.output = np.concatenate([np.zeros((len(self.parameters) + 2 * self.m, 0)), *columns], axis=1)
-        self.size = self.n + self.lagging + len(self.transition)
-        states = dynamics.state_coordinates
-        self.measurement_std = per_entry("Uncertainty: measurement", uncertainty.measurement, states)
-
-    def _weights(self, unknown: Unknown) -> Array:
-        """The weights of an unknown in the parameters, and the gain and the offset of each control, (P + 2 m,)."""
-        controls, count = self.dynamics.control_coordinates.names, len(self.parameters)
-        weights = np.zeros(count + 2 * self.m)
-        for name, weight in unknown.shares.items():
-            if name.startswith(GAIN):
-                weights[count + controls.index(name.removeprefix(GAIN))] = weight
-            elif name.startswith(OFFSET):
-                weights[count + self.m + controls.index(name.removeprefix(OFFSET))] = weight
-            else:
-                weights[self.parameters.index(name)] = weight
-        return weights
-
-    def under(self, uncertainty: Uncertainty) -> "PlanModel":
-        """The model for another uncertainty, with the derivatives along the plan that are known already."""
-        other = PlanModel(self.dynamics, self.plan, uncertainty, self.sensor)
-        same = ["jacobian"] + ["effects"] * (self.parameters == other.parameters)
-        vars(other).update((name, getattr(self, name)) for name in same)
-        return other
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the entries of z for messages, (Z,)."""
-        names = [*self.dynamics.state_coordinates.names]
-        names += [f"what {control} has reached" for control in self.dynamics.control_coordinates.names[: self.lagging]]
-        for unknown, states in zip(self.remembered, self.unknown_states, strict=True):
-            names += [unknown.name] * len(states)
-        return tuple(names)
-
-    # For compiled code.
+        self._slopes = dict[str, Array]()  # of the steps in each parameter that was asked for
 
     @cached_property
     def compiled(self) -> CompiledModule:
-        """`kernels/feedback.py`, for these sizes."""
-        unknown = len(self.parameters)
-        source = source_of(
-            feedback, LAG=self.lagging, D=len(self.transition), Y=self.sensor.size, P=unknown, Z=self.size,
-            V=unknown + 2 * self.m, NUMBERS=len(self.predictor.dynamics.parameters),
-            PADDED_D=max(len(self.transition), 1),
-        )  # fmt: skip
-        label = f"a filter of {self.size} numbers ({self.n} states, {self.m} controls)"
-        return module_of(source, label, N=self.n, M=self.m, W=self.n + self.m)
+        """`kernels/feedback.py`, for the functions of the plan's knots alone."""
+        source = source_of(feedback, Y=self.sensor.size, NUMBERS=len(self.model.parameters))
+        return module_of(
+            source, f"a plan of {self.n} states and {self.m} controls", N=self.n, M=self.m, W=self.n + self.m
+        )
 
     @cached_property
-    def predictor(self) -> Predictor:
-        places = self.dynamics.places
-        unknown = np.array([places[name] for name in self.parameters], dtype=np.float64)
-        lag, dynamics = np.array([self.lag.left, self.lag.mean]), dynamics_model(self.dynamics)
-        return Predictor(dynamics, self.plan.dt, unknown, lag, self.transition, self.output)
+    def model(self) -> DynamicsModel:
+        """The dynamics, for compiled code."""
+        return dynamics_model(self.dynamics)
 
     @cached_property
     def compiled_sensor(self) -> SensorModel:
@@ -229,77 +150,30 @@ class PlanModel:
         measure, slope = module.addresses("measure", "measure_slope")
         return SensorModel(measure, slope, self.sensor.data)
 
-    # Along the plan.
-
     @cached_property
     def jacobian(self) -> Array:
         """[A B] of each step, (T, n, n + m)."""
         plan = self.plan
         following, jacobian = np.empty((plan.steps, self.n)), np.empty((plan.steps, self.n, self.n + self.m))
-        states, controls, dynamics = in_c_order(plan.states), in_c_order(plan.controls), self.predictor.dynamics
+        states, controls = in_c_order(plan.states), in_c_order(plan.controls)
         with self.dynamics.quiet():
-            self.compiled.slopes_along(plan.steps, states, controls, dynamics, plan.dt, following, jacobian)
+            self.compiled.slopes_along(plan.steps, states, controls, self.model, plan.dt, following, jacobian)
         return jacobian
 
-    @cached_property
-    def effects(self) -> Array:
-        """Effect of the parameters, gains and offsets on the next state, (T, n, P + 2 m)."""
-        plan, count = self.plan, len(self.parameters)
-        B = self.jacobian[:, :, self.n :]
-        slopes = np.empty((plan.steps, self.n, count))
-        if count:
-            sizes = np.abs([self.dynamics.parameters[name] for name in self.parameters])
-            most = np.where(sizes > 0, np.maximum(OF_SMALL * sizes, LEAST_STEP), np.inf)
-            changes = np.minimum(STEP * np.maximum(sizes, 1.0), most)
-            states, controls, model = in_c_order(plan.states), in_c_order(plan.controls), self.predictor
+    def effect(self, parameter: str) -> Array:
+        """The derivative of the next state in a parameter at each step, (T, n, 1)."""
+        if parameter not in self._slopes:
+            plan, slopes = self.plan, np.empty((self.plan.steps, self.n, 1))
+            size, index = abs(self.dynamics.parameters[parameter]), self.dynamics.places[parameter]
+            most = max(OF_SMALL * size, LEAST_STEP) if size > 0 else np.inf
+            indices, changes = np.array([float(index)]), np.array([min(STEP * max(size, 1.0), most)])
+            states, controls = in_c_order(plan.states), in_c_order(plan.controls)
             with self.dynamics.quiet():
                 self.compiled.parameter_slopes(
-                    plan.steps, states, controls, model.dynamics, plan.dt, model.parameter_indices, changes, slopes
+                    plan.steps, states, controls, self.model, plan.dt, indices, changes, slopes
                 )
-        return np.concatenate([slopes, B * plan.controls[:, None, :], B], axis=2)
-
-    @cached_property
-    def E(self) -> Array:
-        """Effect of the unknowns' states on the next state, (T, n, D)."""
-        return self.effects @ self.output
-
-    @cached_property
-    def step(self) -> LinearSteps:
-        """The model, as a mean over commands that arrive and commands that get lost."""
-        return self._step(self.lag)
-
-    @cached_property
-    def arriving(self) -> LinearSteps:
-        """The model for a command that arrives. A lost one is as if the command had been the actuators' states."""
-        lost = self.uncertainty.command_loss
-        return self._step(Lag.of(self.uncertainty.lag, self.plan.dt)) if lost else self.step
-
-    def _step(self, lag: Lag) -> LinearSteps:
-        n, a, steps = self.n, self.lagging, self.plan.steps
-        F, G = np.zeros((steps, self.size, self.size)), np.zeros((steps, self.size, self.m))
-        F[:, :n, :n] = self.jacobian[:, :, :n]
-        F[:, :n, n : n + a] = lag.mean * self.jacobian[:, :, n : n + a]
-        F[:, :n, n + a :] = self.E
-        F[:, n : n + a, n : n + a] = lag.left * np.eye(a)
-        F[:, n + a :, n + a :] = self.transition
-        G[:, :n] = (1 - lag.mean) * self.jacobian[:, :, n:]
-        G[:, n : n + a] = (1 - lag.left) * np.eye(self.m)[:a]
-        c = np.zeros((steps, self.size))
-        if a:
-            behind = self.reached[:-1] - self.plan.controls
-            c[:, :n] = np.einsum("tij,tj->ti", self.jacobian[:, :, n:], lag.mean * behind)
-            c[:, n : n + a] = (lag.left - self.lag.left) * behind
-        return LinearSteps(F, G, c)
-
-    @cached_property
-    def reached(self) -> Array:
-        """The actuators' states at each knot under the planned controls, (T+1, m or none)."""
-        plan, a = self.plan, self.lagging
-        reached = np.zeros((plan.steps + 1, a))
-        reached[0] = last = plan.controls[0, :a]
-        for t, control in enumerate(plan.controls if a else ()):
-            reached[t + 1] = last = control + self.lag.left * (last - control)
-        return reached
+            self._slopes[parameter] = slopes
+        return self._slopes[parameter]
 
     @cached_property
     def H(self) -> Array:
@@ -323,24 +197,136 @@ class PlanModel:
         same = np.array([[unit == other for other in units] for unit in units], dtype=np.float64)
         return np.sqrt(reach**2 @ same / same.sum(axis=0))
 
-    def assumed(self, memory: float, effort: Array, bypass: float = 0.0) -> "PlanModel":
-        """The model that a filter assumes of this one, with a memory in s: see `Uncertainty.steady`. Nothing is exact.
 
-        `bypass` is noise on controls that bypasses the actuators, relative to effort times `Lag.mean`: `robust_to_lag`.
-        """
-        stated, space, controls = self.uncertainty, self.dynamics.state_coordinates, self.dynamics.control_coordinates
-        steady, moved, lost = stated.steady(memory), self.reach(effort, [2])[0], stated.command_loss
-        control = per_entry("Uncertainty: control", stated.control, controls)
-        control = np.hypot(control, np.sqrt(lost * (1 - lost)) * STALE * effort)  # the filter expects the mean
-        error = per_entry("Uncertainty: model_error", stated.model_error, space)
-        behind = zip(controls.names, bypass * Lag.of(stated.lag, self.plan.dt).mean * effort, strict=True)
-        directly = [Unknown(OFFSET + name, float(std), time_constant=0.0) for name, std in behind if std]
-        assumed = replace(
-            steady, unknowns=(*steady.unknowns, *directly),
-            control=tuple(np.maximum(control, INEXACT * effort).tolist()),
-            model_error=tuple(np.maximum(error, INEXACT * moved).tolist()),
+class Step(NamedTuple):
+    """The linear model of all steps."""
+
+    F: Array  # (T, Z, Z)
+    G: Array  # (T, Z, m)
+    c: Array  # (T, Z)
+
+
+class PlanModel:
+    """A plan linearised, with an uncertainty.
+
+    Attributes:
+      dynamics, plan, sensor, n, m: those of the derivatives.
+      lagging: number of entries of z for the actuators. size: that of all.
+      arrived: the lag for a command that arrives. lag: as a mean over commands that arrive and commands that get lost.
+      parameters: the parameters of the dynamics that are unknown.
+      remembered: the unknowns that have states. unknown_states: for each of these, the indices of its states.
+      transition: transition matrix of the unknowns' states, (D, D).
+      output: from these to values of the parameters, and the gain and the offset of each control, (P + 2 m, D).
+      measurement_std: standard deviation of the noise on each measured state, (n,).
+    """
+
+    def __init__(self, derivatives: PlanDerivatives, uncertainty: Uncertainty) -> None:
+        self.derivatives, self.uncertainty = derivatives, uncertainty
+        self.dynamics, self.plan, self.sensor = derivatives.dynamics, derivatives.plan, derivatives.sensor
+        uncertainty.check(self.dynamics)
+        self.n, self.m, dt = derivatives.n, derivatives.m, self.plan.dt
+        lost, self.arrived = uncertainty.command_loss, Lag.of(uncertainty.lag, dt)
+        self.lagging = self.m if uncertainty.lag > 0 or lost > 0 else 0
+        self.lag = Lag(lost + (1 - lost) * self.arrived.left, lost + (1 - lost) * self.arrived.mean)
+        named = dict.fromkeys(name for unknown in uncertainty.unknowns for name in unknown.shares)
+        self.parameters = tuple(name for name in named if name in self.dynamics.parameters)
+        self.remembered = tuple(unknown for unknown in uncertainty.unknowns if not unknown.white)
+        self._filters = [shaping_filter(unknown, dt) for unknown in self.remembered]
+        ends = np.cumsum([0, *(len(shaping.output) for shaping in self._filters)])
+        self.unknown_states = [range(first, end) for first, end in pairwise(ends.tolist())]
+        self.transition = _diagonal([shaping.transition for shaping in self._filters])
+        columns = [
+            self._weights(unknown)[:, None] * shaping.output
+            for unknown, shaping in zip(self.remembered, self._filters, strict=True)
+        ]
+        self.output = np.concatenate([np.zeros((len(self.parameters) + 2 * self.m, 0)), *columns], axis=1)
+        self.size = self.n + self.lagging + len(self.transition)
+        states = self.dynamics.state_coordinates
+        self.measurement_std = per_entry("Uncertainty: measurement", uncertainty.measurement, states)
+
+    def _weights(self, unknown: Unknown) -> Array:
+        """The weights of an unknown in the parameters, and the gain and the offset of each control, (P + 2 m,)."""
+        controls, count = self.dynamics.control_coordinates.names, len(self.parameters)
+        weights = np.zeros(count + 2 * self.m)
+        for name, weight in unknown.shares.items():
+            if name.startswith(GAIN):
+                weights[count + controls.index(name.removeprefix(GAIN))] = weight
+            elif name.startswith(OFFSET):
+                weights[count + self.m + controls.index(name.removeprefix(OFFSET))] = weight
+            else:
+                weights[self.parameters.index(name)] = weight
+        return weights
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the entries of z for messages, (Z,)."""
+        names = [*self.dynamics.state_coordinates.names]
+        names += [f"what {control} has reached" for control in self.dynamics.control_coordinates.names[: self.lagging]]
+        for unknown, states in zip(self.remembered, self.unknown_states, strict=True):
+            names += [unknown.name] * len(states)
+        return tuple(names)
+
+    # For compiled code.
+
+    @cached_property
+    def compiled(self) -> CompiledModule:
+        """`kernels/feedback.py`, for these sizes."""
+        unknown = len(self.parameters)
+        source = source_of(
+            feedback, LAG=self.lagging, D=len(self.transition), Y=self.sensor.size, P=unknown, Z=self.size,
+            V=unknown + 2 * self.m, NUMBERS=len(self.derivatives.model.parameters),
+            PADDED_D=max(len(self.transition), 1),
         )  # fmt: skip
-        return self.under(assumed)
+        label = f"a filter of {self.size} numbers ({self.n} states, {self.m} controls)"
+        return module_of(source, label, N=self.n, M=self.m, W=self.n + self.m)
+
+    @cached_property
+    def predictor(self) -> Predictor:
+        places = self.dynamics.places
+        unknown = np.array([places[name] for name in self.parameters], dtype=np.float64)
+        lag = np.array([self.lag.left, self.lag.mean])
+        return Predictor(self.derivatives.model, self.plan.dt, unknown, lag, self.transition, self.output)
+
+    # Along the plan.
+
+    @cached_property
+    def effects(self) -> Array:
+        """Effect of the parameters, gains and offsets on the next state, (T, n, P + 2 m)."""
+        B, slopes = self.derivatives.jacobian[:, :, self.n :], map(self.derivatives.effect, self.parameters)
+        return np.concatenate([*slopes, B * self.plan.controls[:, None, :], B], axis=2)
+
+    @cached_property
+    def step(self) -> Step:
+        """The model, as a mean over commands that arrive and commands that get lost."""
+        return self.step_with(self.lag)
+
+    def step_with(self, lag: Lag) -> Step:
+        """The model for a lag: with `arrived`, a lost command is as if it had been the actuators' states."""
+        n, a, steps, jacobian = self.n, self.lagging, self.plan.steps, self.derivatives.jacobian
+        F, G = np.zeros((steps, self.size, self.size)), np.zeros((steps, self.size, self.m))
+        F[:, :n, :n] = jacobian[:, :, :n]
+        F[:, :n, n : n + a] = lag.mean * jacobian[:, :, n : n + a]
+        F[:, :n, n + a :] = self.effects @ self.output
+        F[:, n : n + a, n : n + a] = lag.left * np.eye(a)
+        F[:, n + a :, n + a :] = self.transition
+        G[:, :n] = (1 - lag.mean) * jacobian[:, :, n:]
+        G[:, n : n + a] = (1 - lag.left) * np.eye(self.m)[:a]
+        c = np.zeros((steps, self.size))
+        if a:
+            behind = self.reached[:-1] - self.plan.controls
+            c[:, :n] = np.einsum("tij,tj->ti", jacobian[:, :, n:], lag.mean * behind)
+            c[:, n : n + a] = (lag.left - self.lag.left) * behind
+        return Step(F, G, c)
+
+    @cached_property
+    def reached(self) -> Array:
+        """The actuators' states at each knot under the planned controls, (T+1, m or none)."""
+        plan, a = self.plan, self.lagging
+        reached = np.zeros((plan.steps + 1, a))
+        reached[0] = last = plan.controls[0, :a]
+        for t, control in enumerate(plan.controls if a else ()):
+            reached[t + 1] = last = control + self.lag.left * (last - control)
+        return reached
 
     # Noise, as square roots: a root times its transpose is the covariance.
 
@@ -353,38 +339,31 @@ class PlanModel:
 
     @cached_property
     def disturbing(self) -> Array:
-        """Effects on z of independent standard normal numbers that add up to w: another square root, (T, Z, any)."""
-        varying, constant = self._disturbing
-        return np.concatenate([varying, np.broadcast_to(constant, (len(varying), *constant.shape))], axis=2)
+        """Effects on z of independent standard normal numbers that add up to w: another square root, (T, Z, any).
 
-    @cached_property
-    def _disturbing(self) -> tuple[Array, Array]:
-        """The effects that vary along the plan, and those that do not, (Z, any)."""
-        n, first, steps = self.n, self.n + self.lagging, self.plan.steps
+        The last columns, of the model's error and of the unknowns, are the same at all steps.
+        """
+        n, m, first, uncertainty = self.n, self.m, self.n + self.lagging, self.uncertainty
         states, controls = self.dynamics.state_coordinates, self.dynamics.control_coordinates
-        commanded = self.arriving.G * per_entry("Uncertainty: control", self.uncertainty.control, controls)
-        if self.uncertainty.lag == 0:
-            commanded[:, n:first] = 0.0  # the command that stays in force after a loss has new noise
-        white = [unknown.std * self._weights(unknown) for unknown in self.uncertainty.unknowns if unknown.white]
-        pushed = np.zeros((steps, self.size, len(white)))
+        white = [unknown.std * self._weights(unknown) for unknown in uncertainty.unknowns if unknown.white]
+        constant = m + len(white)
+        root = np.zeros((self.plan.steps, self.size, constant + n + self.size - first))
+        commanded = self.step_with(self.arrived).G
+        root[:, :, :m] = commanded * per_entry("Uncertainty: control", uncertainty.control, controls)
+        if uncertainty.lag == 0:
+            root[:, n:first, :m] = 0.0  # the command that stays in force after a loss has new noise
         if white:
-            pushed[:, :n] = self.effects @ np.array(white).T
-        error = np.zeros((self.size, n))
-        error[range(n), range(n)] = per_entry("Uncertainty: model_error", self.uncertainty.model_error, states)
-        drawn = np.zeros((self.size, self.size - first))
-        drawn[first:] = _diagonal([shaping.noise for shaping in self._filters])
-        return np.concatenate([commanded, pushed], axis=2), np.concatenate([error, drawn], axis=1)
+            root[:, :n, m:constant] = self.effects @ np.array(white).T
+        error = per_entry("Uncertainty: model_error", uncertainty.model_error, states)
+        root[:, range(n), range(constant, constant + n)] = error
+        root[:, first:, constant + n :] = _diagonal([shaping.noise for shaping in self._filters])
+        return root
 
     @cached_property
     def process_noise(self) -> Array:
         """Covariance of w, (T, Z, Z)."""
-        varying, constant = self._disturbing
-        return varying @ varying.transpose(0, 2, 1) + constant @ constant.T
-
-    @cached_property
-    def measurement_root(self) -> Array:
-        """Square root of the covariance of v, (T+1, Y, n)."""
-        return self.H * self.measurement_std
+        varying, constant = np.split(self.disturbing, [self.lagging - self.size], axis=2)
+        return varying @ varying.transpose(0, 2, 1) + constant[0] @ constant[0].T
 
 
 def recursions() -> CompiledModule:

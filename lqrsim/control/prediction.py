@@ -28,7 +28,7 @@ import numpy.typing as npt
 from scipy.special import betaincinv, ndtr, owens_t
 
 from lqrsim.control.controllers import Controller, turn_to_nearest
-from lqrsim.control.plan_model import Lag, PlanModel, recursions
+from lqrsim.control.plan_model import PlanModel, recursions
 from lqrsim.control.uncertainty import per_entry, triangular_root
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels.records import LoopArrays, LoopMoments, LoopSizes, LoopWork, zeros_of
@@ -227,8 +227,9 @@ class LinearLoop:
         else:
             # F and K act on the corrected estimate. With losses, all measurements count less.
             assumed, received = self.assumed or first, 1 - first.uncertainty.loss
-            seen = received * (self.filter_gain @ first.H)[:-1, None]
-            measured = np.sqrt(received) * (self.filter_gain @ first.measurement_root)[:-1, None]
+            H = first.derivatives.H
+            seen = received * (self.filter_gain @ H)[:-1, None]
+            measured = np.sqrt(received) * (self.filter_gain @ (H * first.measurement_std))[:-1, None]
             for after, on in ((gain, K), (assumed.step.F[:, None], F[..., stated:, :])):
                 on[..., stated:size], on[..., :n] = after, after @ seen
                 on[..., stated : stated + n] -= on[..., :n]
@@ -344,9 +345,9 @@ class _Robots:
         self.z = start + self._normal(model.size) @ model.start_root.T
         # Noise on controls is added before the limits, so it does not count as noise on states.
         self._control_std = per_entry("Uncertainty: control", uncertainty.control, model.dynamics.control_coordinates)
-        self._process_roots = triangular_root(model.under(replace(uncertainty, control=0.0)).disturbing)
-        arrived = Lag.of(uncertainty.lag, plan.dt)
-        predictor = model.predictor._replace(lag=np.array([arrived.left, arrived.mean]))
+        pushed = PlanModel(model.derivatives, replace(uncertainty, control=0.0))
+        self._process_roots = triangular_root(pushed.disturbing)
+        predictor = model.predictor._replace(lag=np.array([model.arrived.left, model.arrived.mean]))
         self._command = np.zeros((trials, model.m))
         self._predict = model.compiled.lay_out("predict", trials, self._command, predictor, self.z)
         # Measurements and commands under way. The first measurement is repeated until it arrives. The plan's controls

@@ -40,7 +40,7 @@ from scipy.special import ndtr
 
 from lqrsim.annotations import Positive, checked
 from lqrsim.control.controllers import Feedback, check_plan
-from lqrsim.control.plan_model import PlanModel, recursions
+from lqrsim.control.plan_model import PlanDerivatives, PlanModel, recursions
 from lqrsim.control.prediction import DeviationNorm, LinearLoop, Surroundings, sample_loop
 from lqrsim.control.uncertainty import Uncertainty, per_entry
 from lqrsim.errors import Array, InputError, check_kind, check_number
@@ -145,7 +145,7 @@ def tracking_laws(model: PlanModel, weights: Weights, noise: Array | None = None
     movable, width = n + model.lagging, model.size + 1  # the states that controls can move, and numbers of (y, d, 1)
     state, end = np.atleast_2d(weights.state), np.atleast_2d(weights.end)
     # (y', d, 1) of (y, d, 1, u): the law assumes that d goes on as it is.
-    (F, G, c), forward = model.arriving, np.zeros((steps, width, width + m))
+    (F, G, c), forward = model.step_with(model.arrived), np.zeros((steps, width, width + m))
     forward[:, :movable] = np.concatenate([F, c[:, :, None], G], axis=2)[:, :movable]
     forward[:, range(movable, width), range(movable, width)] = 1.0
     adjoint = np.concatenate([F[:, :movable, :movable], G[:, :movable]], axis=2).transpose(0, 2, 1)
@@ -154,12 +154,12 @@ def tracking_laws(model: PlanModel, weights: Weights, noise: Array | None = None
         held[:, range(m), range(n, movable)], held[:, :, -1] = 1.0, model.reached[:-1] - model.plan.controls
     compensation = np.zeros((steps, len(state), m, width))
     # M_t, (C, T, m, D), by Q.
-    B = model.jacobian[:, :, n:]
+    B = model.derivatives.jacobian[:, :, n:]
     weighed = B.transpose(0, 2, 1) * state[:, None, None, :]
     curve = weighed @ B
     efforts = np.sqrt(weights.control.min() / weights.control)  # the units in which all controls are alike
     least = 1e-9 * np.vecdot(np.diagonal(curve, axis1=-2, axis2=-1), efforts**2) + 1e-300
-    cancelling = np.linalg.inv(curve + least[..., None, None] * np.diag(efforts**-2)) @ (weighed @ model.E)
+    cancelling = np.linalg.inv(curve + least[..., None, None] * np.diag(efforts**-2)) @ (weighed @ F[:, :n, movable:])
     compensation[..., movable:-1] = weights.control[:, None] * cancelling.swapaxes(0, 1)
     cost, products = np.zeros((len(state), movable, width)), np.empty((len(state), movable + m, width + m))
     cost[:, range(n), range(n)] = end
@@ -333,7 +333,7 @@ def tolerances_to_try(model: PlanModel, effort: Array, at_end: float, solution: 
     """
     longest = max(model.plan.steps // 2, PERIODS[0])
     periods = [period for period in PERIODS if period <= longest]
-    tried = list(model.reach(effort, periods))
+    tried = list(model.derivatives.reach(effort, periods))
     if (free := np.isnan(solution.target.state)).any():
         tried += [np.where(free, WIDE * tolerances, tolerances) for tolerances in tried]
     choices = [Weights.of(tuple(tolerances.tolist()), effort, model.dynamics, at_end=at_end) for tolerances in tried]
@@ -380,14 +380,15 @@ def track(
     kinds, wanted = (Uncertainty, type(None)), "an Uncertainty, such as uncertainty_of(...)"
     check_kind("track: uncertainty", uncertainty, kinds, wanted)
     command_loss = 0.0 if uncertainty is None else uncertainty.command_loss
-    model = PlanModel(dynamics, plan, Uncertainty(command_loss=command_loss))
+    derivatives = PlanDerivatives(dynamics, plan)
+    model = PlanModel(derivatives, Uncertainty(command_loss=command_loss))
     efforts = effort_of(effort, dynamics)
     if tolerate is not None:
         law = _law(problem, solution, model, Weights.of(tolerate, efforts, dynamics, at_end=at_end), risk)
     elif uncertainty is None:
         raise InputError("track: tolerate: got none, want deviations, such as {'m': 0.05, 'm/s': 0.2}, or uncertainty=")
     else:
-        truth = PlanModel(dynamics, plan, uncertainty)
+        truth = PlanModel(derivatives, uncertainty)
 
         def moments(laws: Laws) -> LoopMoments:
             limits = solution.policy.control_coordinates.limits

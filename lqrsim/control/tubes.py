@@ -16,7 +16,7 @@ from scipy.special import ndtr
 from lqrsim.annotations import Share, checked, repr_of
 from lqrsim.control.controllers import BeliefFeedback, ControllerLike, Feedback, check_plan
 from lqrsim.control.offset_free import OffsetFree
-from lqrsim.control.plan_model import PlanModel
+from lqrsim.control.plan_model import PlanDerivatives, PlanModel
 from lqrsim.control.prediction import LinearLoop, Surroundings, sample_loop
 from lqrsim.control.tracking import Judge
 from lqrsim.control.uncertainty import Uncertainty
@@ -130,7 +130,7 @@ def predict_tube(
     else:
         chosen: object = solution.policy if controller is None else controller
         policy = check_kind("predict_tube: controller", chosen, AffinePolicy, "an OffsetFree or an AffinePolicy")
-        model = PlanModel(problem.dynamics, plan, uncertainty)
+        model = PlanModel(PlanDerivatives(problem.dynamics, plan), uncertainty)
         at_plan = policy.state_coordinates.nearest(plan.states[:-1], policy.nominal)
         offset = np.einsum("tij,tj->ti", policy.gain, at_plan) + policy.offset - plan.controls
         loop = LinearLoop(model, policy.gain, offset, None, policy.control_coordinates.limits)
