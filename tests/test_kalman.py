@@ -17,8 +17,7 @@ from scipy.linalg import expm
 from scipy.stats import binom, chi2
 
 import lqrsim as ls
-from lqrsim.control.offset_free import PLAUSIBLE, RESOLUTION, kalman_filter
-from lqrsim.control.plan_model import PlanDerivatives, PlanModel
+from lqrsim.control.plan_model import PLAUSIBLE, RESOLUTION, PlanDerivatives, PlanModel, kalman_filter
 from lqrsim.control.uncertainty import triangular_root
 from lqrsim.disturbances import Uncertainty, Unknown
 from lqrsim.errors import Array

@@ -33,9 +33,8 @@ from lqrsim.codegen.plain import plain_functions
 from lqrsim.codegen.printer import Program
 from lqrsim.codegen.sources import Scope, ScopedFunction, Source, source_of, text_source
 from lqrsim.codegen.user_functions import numbers_of
-from lqrsim.control import offset_free, prediction, tracking
+from lqrsim.control import plan_model, prediction, tracking
 from lqrsim.control.controllers import turning_of
-from lqrsim.control.offset_free import with_filter
 from lqrsim.control.plan_model import PlanDerivatives, PlanModel
 from lqrsim.control.tracking import Weights
 from lqrsim.disturbances import Uncertainty, Unknown
@@ -1308,8 +1307,8 @@ class TestDesigns:
         limits = np.full(controls, -1.0), np.full(controls, 1.5)
 
         def design() -> list[Array]:
-            filtered = offset_free.kalman_filter(model, known=np.tril(rng_of_root.normal(size=(model.size,) * 2)))
-            filtered_from_start = offset_free.kalman_filter(model)
+            filtered = plan_model.kalman_filter(model, known=np.tril(rng_of_root.normal(size=(model.size,) * 2)))
+            filtered_from_start = plan_model.kalman_filter(model)
             laws = tracking.tracking_laws(model, weights)
             loop = prediction.LinearLoop(model, *laws, filtered_from_start.gain, limits)
             return [
@@ -1317,7 +1316,7 @@ class TestDesigns:
                 *filtered_from_start,
                 *laws,
                 *loop.moments(),
-                *with_filter(model, filtered, limits, laws),
+                *prediction.with_filter(model, filtered, *laws, limits),
             ]
 
         rng_of_root = np.random.default_rng(0)
@@ -1335,7 +1334,7 @@ class TestDesigns:
             def __getattr__(self, name: str) -> Callable[..., Any]:
                 return self.lay_out(name)
 
-        for module in (offset_free, tracking, prediction):
+        for module in (plan_model, tracking, prediction):
             monkeypatch.setattr(module, "recursions", lambda: Plain(source_of(recursions)))
         rng_of_root = np.random.default_rng(0)
         for found, compiled_one in zip(design(), wanted, strict=True):

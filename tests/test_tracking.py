@@ -16,9 +16,8 @@ from scipy.linalg import expm
 from sympy import cos, exp, sin
 
 import lqrsim as ls
-from lqrsim.control.offset_free import kalman_filter, with_filter
-from lqrsim.control.plan_model import PlanDerivatives, PlanModel, recursions
-from lqrsim.control.prediction import LinearLoop
+from lqrsim.control.plan_model import PlanDerivatives, PlanModel, kalman_filter, recursions
+from lqrsim.control.prediction import LinearLoop, with_filter
 from lqrsim.control.tracking import Laws, Weights, tracking_laws
 from lqrsim.disturbances import Uncertainty, Unknown
 from lqrsim.errors import Array
@@ -267,7 +266,7 @@ def test_choosing_predicts_the_moments_of_the_whole_recursion(structure: int, se
     laws = Laws(rng.normal(size=(3, steps, m, model.size)), rng.normal(size=(3, steps, m)))
     bounds = (np.full(m, -1.0), np.full(m, 1.5)) if limits else (np.full(m, -np.inf), np.full(m, np.inf))
     filtered = kalman_filter(model)
-    part = with_filter(model, filtered, bounds, laws)
+    part = with_filter(model, filtered, *laws, bounds)
     whole = LinearLoop(model, *laws, filtered.gain, bounds).moments(n)
     for found, wanted in zip(part, whole, strict=True):
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9 * max(1.0, np.abs(wanted).max()))

@@ -1,4 +1,4 @@
-"""The linear model about a plan, on which tracking laws, filters and tubes are based.
+"""The linear model about a plan, on which tracking laws and tubes are based, and its Kalman filter.
 
 A deviation from the plan is z = (e, a, d): the deviation of the state (n), the deviation of the actuators' states (m if
 they lag, else none), and the states of the unknowns (D). With u the deviation of the command,
@@ -9,6 +9,11 @@ c is the effect of actuator lag on a plan that was made without lag. The nominal
 which the planned controls drive them.
 If commands get lost, F, G and c are means over two cases: a command that arrives, and a lost command, after which the
 actuators stay as they are.
+
+`kalman_filter` computes its gains in advance, because they do not depend on the measurements. It propagates square
+roots of its covariances by orthogonal transformations, and never subtracts covariances. The covariances stay positive
+semidefinite, and each standard deviation keeps its own relative precision. This holds even if sensors are exact, if two
+sensors measure the same quantity, or if two unknowns are nearly identical.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,7 +33,15 @@ from lqrsim.control.uncertainty import GAIN, OFFSET, Uncertainty, Unknown, per_e
 from lqrsim.errors import Array, InputError, check_array, check_items, check_name, excerpt
 from lqrsim.kernels import feedback
 from lqrsim.kernels import recursions as recursion_kernels
-from lqrsim.kernels.records import DynamicsModel, Predictor, SensorModel
+from lqrsim.kernels.records import (
+    DynamicsModel,
+    FilterModel,
+    FilterRoots,
+    FilterSizes,
+    Predictor,
+    SensorModel,
+    zeros_of,
+)
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.coordinates import Coordinates
 from lqrsim.results.solution_parts import Trajectory
@@ -98,8 +111,18 @@ def _symbolic(function: Callable[[Any, Any, Any], Any], states: Sequence[str]) -
     return Sensor(text_source(str(written["source"]), of), np.zeros(1), size, tuple(f"{of}[{i}]" for i in range(size)))
 
 
-# Step of a parameter for differences, relative to its value if that is larger than 1; and the largest relative to a
-# small value, such as a moment of inertia of 1e-5 kg m^2, unless the step is then one of rounding.
+# The least standard deviation of a measured number's noise, relative to that of its prediction. It makes the innovation
+# covariance of exact or redundant sensors invertible. To decide on its rank instead would be discontinuous.
+RESOLUTION = 1e-6
+LEAST_STD = 1e-150  # the same, absolute, if the prediction is certain: its square is still a positive number
+# The largest correction of an unknown by one measurement, in standard deviations of it. If the model is right,
+# one correction in 5e8 is larger. In a run, such corrections have other causes: a lost command or first measurement or
+# a push that the uncertainty lacks. Attributed to a mass, the error of a state can make the mass negative. The limit
+# doubles with each measurement that exceeds it. A validation gate, which rejects such measurements, could reject a
+# parameter that is far from its stated value for ever.
+PLAUSIBLE = 6.0
+# The step of differences by a parameter p is STEP max(1, |p|), but at most OF_SMALL |p|, for a moment of inertia may be
+# 1e-5 kg m^2. This cap is at least LEAST_STEP, below which rounding dominates.
 STEP, OF_SMALL, LEAST_STEP = 1e-5, 1e-3, 1e-10
 
 
@@ -198,7 +221,7 @@ class PlanDerivatives:
         return np.sqrt(reach**2 @ same / same.sum(axis=0))
 
 
-class Step(NamedTuple):
+class LinearSteps(NamedTuple):
     """The linear model of all steps."""
 
     F: Array  # (T, Z, Z)
@@ -211,7 +234,7 @@ class PlanModel:
 
     Attributes:
       dynamics, plan, sensor, n, m: those of the derivatives.
-      lagging: number of entries of z for the actuators. size: that of all.
+      lagging: number of entries of z for the actuators. size: of z.
       arrived: the lag for a command that arrives. lag: as a mean over commands that arrive and commands that get lost.
       parameters: the parameters of the dynamics that are unknown.
       remembered: the unknowns that have states. unknown_states: for each of these, the indices of its states.
@@ -296,11 +319,11 @@ class PlanModel:
         return np.concatenate([*slopes, B * self.plan.controls[:, None, :], B], axis=2)
 
     @cached_property
-    def step(self) -> Step:
+    def step(self) -> LinearSteps:
         """The model, as a mean over commands that arrive and commands that get lost."""
         return self.step_with(self.lag)
 
-    def step_with(self, lag: Lag) -> Step:
+    def step_with(self, lag: Lag) -> LinearSteps:
         """The model for a lag: with `arrived`, a lost command is as if it had been the actuators' states."""
         n, a, steps, jacobian = self.n, self.lagging, self.plan.steps, self.derivatives.jacobian
         F, G = np.zeros((steps, self.size, self.size)), np.zeros((steps, self.size, self.m))
@@ -316,7 +339,7 @@ class PlanModel:
             behind = self.reached[:-1] - self.plan.controls
             c[:, :n] = np.einsum("tij,tj->ti", jacobian[:, :, n:], lag.mean * behind)
             c[:, n : n + a] = (lag.left - self.lag.left) * behind
-        return Step(F, G, c)
+        return LinearSteps(F, G, c)
 
     @cached_property
     def reached(self) -> Array:
@@ -364,6 +387,53 @@ class PlanModel:
         """Covariance of w, (T, Z, Z)."""
         varying, constant = np.split(self.disturbing, [self.lagging - self.size], axis=2)
         return varying @ varying.transpose(0, 2, 1) + constant[0] @ constant[0].T
+
+
+class KalmanFilter(NamedTuple):
+    """A filter's gains and covariances."""
+
+    gain: Array  # K, (T+1, Z, Y)
+    predicted: Array  # (T+1, Z, Z), covariance of the error of z before the measurement of each knot
+    corrected: Array  # (T+1, Z, Z), the same after it
+    corrected_root: Array  # (T+1, Z, Z), lower triangular square roots of `corrected`, with nonnegative diagonals
+    innovation: Array  # (T+1, Y, Y), covariance of the measurement minus its prediction
+    limit: Array  # (T+1, D), largest correction of each state of the unknowns by one measurement; see `PLAUSIBLE`
+
+
+def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
+    """The filter for a plan's model.
+
+    Args:
+      known: a square root (Z, Z) of the covariance after the measurement of the first knot, if the filter about an
+        earlier plan has used that measurement; the gain there is then zero. By default the filter begins before that
+        measurement, with the model's `start_root`.
+    """
+    size, n, H, disturbing = model.size, model.n, model.derivatives.H, model.disturbing
+    measured = model.sensor.size
+    sizes = FilterSizes(
+        model.plan.steps + 1, size, measured, n, disturbing.shape[2], known is not None, RESOLUTION, LEAST_STD
+    )
+    work = np.empty(max((measured + size) * (n + measured + size), size * (size + disturbing.shape[2])))
+    arrays = {"root": np.array(model.start_root if known is None else known, order="C"), "work": work}
+    roots = zeros_of(FilterRoots, arrays, T=model.plan.steps, Z=size, Y=measured)
+    system = FilterModel(*map(np.ravel, (model.step.F, H, H * model.measurement_std, disturbing)))
+    recursions().filter_along(sizes, system, FilterRoots(*map(np.ravel, roots)))
+    _, before, after, innovation_root, correction_root, _ = roots
+    limit = PLAUSIBLE * np.sqrt((correction_root[:, n + model.lagging :] ** 2).sum(axis=2))
+    predicted, corrected, innovation = (root @ root.transpose(0, 2, 1) for root in (before, after, innovation_root))
+    return KalmanFilter(_gains(correction_root, innovation_root), predicted, corrected, after, innovation, limit)
+
+
+def _gains(correction_root: Array, root: Array) -> Array:
+    """The K of K S = `correction_root` (T+1, Z, Y), for lower triangular S = `root` (T+1, Y, Y), at all knots at once.
+
+    By substitution: OpenBLAS solves even such small systems with all its threads, which then wait for each other.
+    """
+    gain = np.empty_like(correction_root)
+    for j in range(root.shape[1] - 1, -1, -1):
+        solved = (gain[:, :, j + 1 :] @ root[:, j + 1 :, j, None])[:, :, 0]
+        gain[:, :, j] = (correction_root[:, :, j] - solved) / root[:, j, j, None]
+    return gain
 
 
 def recursions() -> CompiledModule:

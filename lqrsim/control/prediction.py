@@ -28,7 +28,7 @@ import numpy.typing as npt
 from scipy.special import betaincinv, ndtr, owens_t
 
 from lqrsim.control.controllers import Controller, turn_to_nearest
-from lqrsim.control.plan_model import PlanModel, recursions
+from lqrsim.control.plan_model import KalmanFilter, PlanModel, recursions
 from lqrsim.control.uncertainty import per_entry, triangular_root
 from lqrsim.errors import Array, InputError
 from lqrsim.kernels.records import LoopArrays, LoopMoments, LoopSizes, LoopWork, zeros_of
@@ -251,6 +251,30 @@ class LinearLoop:
             on_command @ on_command.swapaxes(-1, -2), jointly, reached, *self.limits,
         )  # fmt: skip
         return moments_of(arrays, stated, count, first.uncertainty.command_loss)
+
+
+def with_filter(
+    model: PlanModel, kalman: KalmanFilter, gain: Array, offset: Array, limits: tuple[Array, Array]
+) -> LoopMoments:
+    """Moments of the states under C laws that follow a filter's estimates.
+
+    The filter is assumed to be right about the noise. Its error is then independent of its estimate, and what it learns
+    from a measurement is noise that moves the estimate. The unknowns' estimates are moved by no law.
+    """
+    n, size = model.n, model.n + model.lagging
+    learned = kalman.gain @ kalman.innovation @ kalman.gain.transpose(0, 2, 1)
+    F, G, c, noise = (array[:, None, :size] for array in (*model.step, learned))
+    gain, offset = gain.swapaxes(0, 1), offset.swapaxes(0, 1)
+    planned = model.plan.controls
+    arrays = LoopArrays(
+        F, G.swapaxes(-1, -2), c, noise, learned[:, size:, size:], model.transition, gain, planned[:, None] + offset,
+        planned, np.zeros((*offset.shape, model.m)), np.zeros(0), model.reached, *limits,
+    )  # fmt: skip
+    moments = LoopMoments(*(moment[0] for moment in moments_of(arrays, size, n)))
+    return moments._replace(
+        covariance=moments.covariance + kalman.corrected[:, :n, :n],
+        across=moments.across + model.step.F[:, :n] @ kalman.corrected[:-1, :, :n],
+    )
 
 
 # The number of collisions that the linear model's chance counts as, when it is combined with those of the trials: with

@@ -30,7 +30,6 @@ If collisions are what makes a law fail, laws with an emphasis on the deviations
 """
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -40,8 +39,8 @@ from scipy.special import ndtr
 
 from lqrsim.annotations import Positive, checked
 from lqrsim.control.controllers import Feedback, check_plan
-from lqrsim.control.plan_model import PlanDerivatives, PlanModel, recursions
-from lqrsim.control.prediction import DeviationNorm, LinearLoop, Surroundings, sample_loop
+from lqrsim.control.plan_model import KalmanFilter, PlanDerivatives, PlanModel, recursions
+from lqrsim.control.prediction import DeviationNorm, LinearLoop, Surroundings, sample_loop, with_filter
 from lqrsim.control.uncertainty import Uncertainty, per_entry
 from lqrsim.errors import Array, InputError, check_kind, check_number
 from lqrsim.kernels.records import LoopMoments, PassArrays, PassSizes, PassWork
@@ -72,10 +71,11 @@ NARROW = 0.02
 # is, the gentler the laws are, and the weaker their emphasis.
 FRAGILE = 5.0
 # The deviations from which a law must bring the model back: pairs drawn from the tube at this number of knots. It does
-# not if the model gets farther from the plan than LOST times the widest part of the tube. The same counts for the
+# not if the model gets farther from the plan than FARTHEST times the widest part of the tube. The same counts for the
 # trials with unknowns that are drawn, which are run if more than LIMITED of the commands are beyond the limits.
-KNOTS, PAIRS, LOST = 3, 3, 6.0
+KNOTS, PAIRS, FARTHEST = 3, 3, 6.0
 TRIALS, LIMITED = 100, 1e-3
+WORST = (1.0, 1e30, 1.0)  # the `Predictions` for a loop whose moments are not finite
 OPEN = Surroundings((), (), (), 0.0)
 
 
@@ -84,10 +84,6 @@ class Laws(NamedTuple):
 
     gain: Array  # (T, m, Z), or (C, T, m, Z)
     offset: Array  # (T, m), or (C, T, m)
-
-    def pick(self, i: int) -> "Laws":
-        """One of C."""
-        return Laws(self.gain[i], self.offset[i])
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,15 +105,24 @@ class Weights:
         end[last] *= at_end
         return cls(state**-2.0, effort**-2.0, end**-2.0)
 
-    def pick(self, i: int | None) -> "Weights":
-        """One of C; with None, those of a single law as the only ones of C = 1."""
-        emphasis = None if self.emphasis is None else self.emphasis[i]
-        return Weights(self.state[i], self.control, self.end[i], emphasis)
-
     def stressing(self, emphasis: Array, factors: tuple[float, ...]) -> "Weights":
         """These with an emphasis (T+1, n, n) times each of C factors, as those of C laws to compare."""
         many, factor = np.ones((len(factors), 1)), np.array(factors)[:, None, None, None]
         return Weights(many * self.state, self.control, many * self.end, factor * emphasis)
+
+
+class Candidates(NamedTuple):
+    """C laws to choose from, with the weights that they follow from; or one of them."""
+
+    weights: Weights
+    laws: Laws
+
+    def pick(self, i: int) -> "Candidates":
+        """One of C."""
+        weights, (gain, offset) = self.weights, self.laws
+        emphasis = None if weights.emphasis is None else weights.emphasis[i]
+        picked = Weights(weights.state[i], weights.control, weights.end[i], emphasis)
+        return Candidates(picked, Laws(gain[i], offset[i]))
 
 
 def effort_of(effort: PerEntry | None, dynamics: Dynamics) -> Array:
@@ -184,8 +189,8 @@ def tracking_laws(model: PlanModel, weights: Weights, noise: Array | None = None
         improve(t, sizes, arrays, work)
         if emphasis is not None:
             cost[:, :n, :n] += emphasis[:, t]
-    chosen = Laws(laws.swapaxes(0, 1)[..., :-1], laws.swapaxes(0, 1)[..., -1])
-    return chosen if weights.state.ndim == 2 else chosen.pick(0)
+    laws = laws.swapaxes(0, 1) if weights.state.ndim == 2 else laws[:, 0]
+    return Laws(laws[..., :-1], laws[..., -1])
 
 
 class Predictions(NamedTuple):
@@ -202,26 +207,46 @@ class Predictions(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """Judges laws about the plan of a solution by the moments of their states, (..., T+1, n) and so on."""
+    """Judges laws about the plan of a solution, by the moments of their states and by runs, in a true system.
+
+    With a filter, the true system is as it assumes, and the laws act on its estimates, else on the measured states.
+    """
 
     problem: Problem
     solution: Solution
-    obstacles: float  # standard deviation of an obstacle's position, in m
+    truth: PlanModel
+    filter: KalmanFilter | None = None
 
     @cached_property
     def surroundings(self) -> Surroundings:
-        return Surroundings.of(self.problem, self.obstacles)
+        return Surroundings.of(self.problem, self.truth.uncertainty.obstacles)
 
     @cached_property
     def norm(self) -> DeviationNorm:
         return DeviationNorm.of(self.solution, self.problem.dynamics.state_coordinates.position)
 
+    @property
+    def limits(self) -> tuple[Array, Array]:
+        return self.solution.policy.control_coordinates.limits
+
+    def moments(self, laws: Laws) -> LoopMoments:
+        """The moments of the states under C laws, (C, ...)."""
+        if self.filter is not None:
+            return with_filter(self.truth, self.filter, *laws, self.limits)
+        n = self.truth.n
+        return LinearLoop(self.truth, laws.gain[..., :n], laws.offset, None, self.limits).moments(n)
+
     def predictions(self, moments: LoopMoments) -> Predictions:
+        """What follows from moments of the states, (..., T+1, n) and so on. Those that are not finite become 0."""
+        finite = np.isfinite(moments.covariance).all(axis=(-3, -2, -1))
+        for moment in moments:
+            moment[~finite] = 0.0
         mean, covariance, plan = moments.mean, moments.covariance, self.solution.trajectory
         collide = self.surroundings.spread(plan.states + mean, covariance, moments.across).chance()[1]
         width = np.sqrt((self.norm.squares(covariance) + self.norm(mean) ** 2).mean(axis=-1))
         miss = self._chance_of_miss(mean[..., -1, :], covariance[..., -1, :, :])
-        return Predictions(collide + miss, width, moments.saturation.mean(axis=(-2, -1)))
+        values = collide + miss, width, moments.saturation.mean(axis=(-2, -1))
+        return Predictions(*(np.where(finite, value, worst) for value, worst in zip(values, WORST, strict=True)))
 
     def _chance_of_miss(self, mean: Array, covariance: Array) -> Array:
         """About the chance to end farther from the plan's end than the goal's radius, by the moments there.
@@ -243,23 +268,29 @@ class Judge:
         extents = np.ptp(self.solution.trajectory.states[:, self.norm.states], axis=0) / self.norm.scale
         return max(float(widths.min()), 1e-3 * (float(extents.max()) or 1.0))
 
-    def runs_lost(self, law: Laws, mean: Array, covariance: Array, farthest: float) -> int:
-        """The number of deviations, drawn from a tube, from which the nonlinear model does not return to its plan.
+    def strays(self, laws: Laws, moments: LoopMoments, i: int) -> int:
+        """The number of runs under one of C laws that get too far from the plan, from likely deviations.
 
-        The law acts on the true state. The tube has these moments of the states, (T+1, n) and (T+1, n, n). A run that
-        gets farther from the plan than `farthest` is lost.
+        The law acts on the true state, in the nonlinear model. If all of these return to the plan, and the law acts on
+        measured states and often reaches the limits, trials with unknowns that are drawn count as well.
         """
-        plan, n, rng, lost = self.solution.trajectory, mean.shape[1], np.random.default_rng(0), 0
+        plan, rng, count = self.solution.trajectory, np.random.default_rng(0), 0
+        law, mean, covariance = Laws(laws.gain[i], laws.offset[i]), moments.mean[i], moments.covariance[i]
+        farthest, n = FARTHEST * np.sqrt(self.norm.squares(covariance).max()), mean.shape[1]
         gain, offset = law_about(plan.states, plan.controls + law.offset, law.gain[..., :n])
         for t in (plan.steps * k // KNOTS for k in range(KNOTS)):
             variances, axes = np.linalg.eigh(covariance[t])
             off = rng.standard_normal((PAIRS, n)) * np.sqrt(np.maximum(variances, 0.0)) @ axes.T
             for start in plan.states[t] + mean[t] + np.concatenate([off, -off]):
                 states, _ = rollout(self.problem, gain[t:], offset[t:], start)
-                with np.errstate(over="ignore", invalid="ignore"):  # of lost runs
+                with np.errstate(over="ignore", invalid="ignore"):  # of runs that diverge
                     distance = self.norm(states - plan.states[t:])
-                lost += not (distance <= farthest).all()
-        return lost
+                count += not (distance <= farthest).all()
+        limited = moments.saturation[i].mean() > LIMITED
+        if count or not limited or self.filter is not None or not self.truth.uncertainty.unknowns:
+            return count
+        run = Feedback(_policy_of(self.solution, law))
+        return int((sample_loop(self.truth, run, self.limits, OPEN, self.norm, TRIALS, 0).farthest > farthest).sum())
 
 
 def _chance_outside(bound: Array | float, off: Array, std: Array) -> Array:
@@ -268,61 +299,46 @@ def _chance_outside(bound: Array | float, off: Array, std: Array) -> Array:
     return ndtr((off - bound) / std) + ndtr((-off - bound) / std)
 
 
-def choose_tolerances(
-    judge: Judge, model: PlanModel, effort: Array, at_end: float, moments: Callable[[Laws], LoopMoments],
-    truth: PlanModel | None = None, *, call: str,
-) -> tuple[Weights, Laws]:  # fmt: skip
+def choose_tolerances(judge: Judge, model: PlanModel, effort: Array, at_end: float, *, call: str) -> Candidates:
     """Choose the tolerances whose law is predicted to fail least often, and that law.
 
     Args:
+      model: what the laws assume.
       call: name of the user's call, for warnings.
-      moments: predicts the states' moments under C laws.
-      truth: model with the unknowns, for trials of laws that act on the measured state itself.
     """
-    tried = tolerances_to_try(model, effort, at_end, judge.solution)
-    laws = tracking_laws(model, tried)
-    loop_moments = moments(laws)
-    predicted = judge.predictions(loop_moments)
+    weights = tolerances_to_try(model, effort, at_end, judge.solution)
+    tried = Candidates(weights, tracking_laws(model, weights))
+    moments = judge.moments(tried.laws)
+    predicted = judge.predictions(moments)
     least = judge.narrowest(predicted.width)
     scores = predicted.scores(least)
-
-    def lost(moments: LoopMoments, laws: Laws, i: int) -> int:
-        law = laws.pick(i)
-        limited = moments.saturation[i].mean() > LIMITED
-        farthest = LOST * np.sqrt(judge.norm.squares(moments.covariance[i]).max())
-        count = judge.runs_lost(law, moments.mean[i], moments.covariance[i], farthest)
-        if count or not limited or truth is None or not truth.uncertainty.unknowns:
-            return count
-        run, limits = Feedback(_policy_of(judge.solution, law)), judge.solution.policy.control_coordinates.limits
-        return int((sample_loop(truth, run, limits, OPEN, judge.norm, TRIALS, 0).farthest > farthest).sum())
-
-    runs = dict[int, int]()  # the number of lost runs of each law
+    strays = dict[int, int]()  # the number of runs that stray under each law
     for best in sorted(range(len(scores)), key=lambda i: (scores[i], -i)):  # of equals the gentlest first
-        runs[best] = lost(loop_moments, laws, best)
-        if not runs[best]:
+        strays[best] = judge.strays(tried.laws, moments, best)
+        if not strays[best]:
             break
     else:
-        best = min(runs, key=lambda i: runs[i])
+        best = min(strays, key=lambda i: strays[i])
         _log.warning(
             "%s: each law that was tried loses the plan from some deviations of the predicted size; the plan's own"
             " policy or tolerances of your own (tolerate=) may do better",
             call,
         )
-    chosen = tried.pick(best), laws.pick(best)
+    chosen = tried.pick(best)
     # The same with emphasis, if it is predicted to fail less often.
     if predicted.saturation[best] > MODELLED:
         return chosen
-    mean, covariance, across = loop_moments.mean[best], loop_moments.covariance[best], loop_moments.across[best]
-    emphasis = judge.surroundings.emphasis(model.plan.states + mean, covariance, across, chosen[0].state)
+    mean, covariance, across = moments.mean[best], moments.covariance[best], moments.across[best]
+    emphasis = judge.surroundings.emphasis(model.plan.states + mean, covariance, across, chosen.weights.state)
     if not emphasis.any():
         return chosen
-    stressing = chosen[0].stressing(emphasis, EMPHASIS)
-    laws = tracking_laws(model, stressing)
-    loop_moments = moments(laws)
-    stressed = judge.predictions(loop_moments).scores(least)
-    i = int(np.argmin(stressed))
-    better = stressed[i] < scores[best] and lost(loop_moments, laws, i) <= runs[best]
-    return (stressing.pick(i), laws.pick(i)) if better else chosen
+    weights = chosen.weights.stressing(emphasis, EMPHASIS)
+    stressed = Candidates(weights, tracking_laws(model, weights))
+    moments = judge.moments(stressed.laws)
+    stressed_scores = judge.predictions(moments).scores(least)
+    i = int(np.argmin(stressed_scores))
+    better = stressed_scores[i] < scores[best] and judge.strays(stressed.laws, moments, i) <= strays[best]
+    return stressed.pick(i) if better else chosen
 
 
 def tolerances_to_try(model: PlanModel, effort: Array, at_end: float, solution: Solution) -> Weights:
@@ -388,14 +404,8 @@ def track(
     elif uncertainty is None:
         raise InputError("track: tolerate: got none, want deviations, such as {'m': 0.05, 'm/s': 0.2}, or uncertainty=")
     else:
-        truth = PlanModel(derivatives, uncertainty)
-
-        def moments(laws: Laws) -> LoopMoments:
-            limits = solution.policy.control_coordinates.limits
-            return LinearLoop(truth, laws.gain[..., : model.n], laws.offset, None, limits).moments(model.n)
-
-        judge = Judge(problem, solution, uncertainty.obstacles)
-        _, law = choose_tolerances(judge, model, efforts, at_end, moments, truth, call="track(...)")
+        judge = Judge(problem, solution, PlanModel(derivatives, uncertainty))
+        law = choose_tolerances(judge, model, efforts, at_end, call="track(...)").laws
     return _policy_of(solution, law)
 
 

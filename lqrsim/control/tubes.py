@@ -17,8 +17,7 @@ from lqrsim.annotations import Share, checked, repr_of
 from lqrsim.control.controllers import BeliefFeedback, ControllerLike, Feedback, check_plan
 from lqrsim.control.offset_free import OffsetFree
 from lqrsim.control.plan_model import PlanDerivatives, PlanModel
-from lqrsim.control.prediction import LinearLoop, Surroundings, sample_loop
-from lqrsim.control.tracking import Judge
+from lqrsim.control.prediction import DeviationNorm, LinearLoop, Surroundings, sample_loop
 from lqrsim.control.uncertainty import Uncertainty
 from lqrsim.errors import Array, InputError, check_count, check_kind, check_seed
 from lqrsim.problem.belief import Belief
@@ -135,8 +134,8 @@ def predict_tube(
         offset = np.einsum("tij,tj->ti", policy.gain, at_plan) + policy.offset - plan.controls
         loop = LinearLoop(model, policy.gain, offset, None, policy.control_coordinates.limits)
         law = Feedback(policy)
-    judge, modelled = Judge(problem, solution, uncertainty.obstacles), loop.model.uncertainty
-    surroundings, norm = judge.surroundings, judge.norm
+    surroundings, modelled = Surroundings.of(problem, uncertainty.obstacles), loop.model.uncertainty
+    norm = DeviationNorm.of(solution, problem.dynamics.state_coordinates.position)
     late = [f"{field} of {getattr(modelled, field)}" for field in ("latency", "delay") if getattr(modelled, field)]
     if samples is None:
         slow = problem.dynamics.by_mujoco or problem.dynamics.level in ("jax", "plain") or surroundings.by_mujoco
