@@ -278,17 +278,15 @@ class Episode:
         self._commanded.commands = controls
         with unlogged():
             loop.period()
-            if loop.step == self._plan.steps:
-                loop.detect_contacts_at_end()
         running, at_horizon = ~self.ended, loop.step == self._plan.steps
-        lost, collided = loop.records.over(loop.step), np.isfinite(loop.collisions.at)
-        over = lost | collided
+        invalid, collided = loop.records.over(loop.step), np.isfinite(loop.collisions.at)
+        over = invalid | collided
         self._terminated[running] = over[running]
         self._truncated[running] = at_horizon & ~over[running]
         ending = (self._terminated | self._truncated) & running
         # A trial that has become unstable has no valid state; its last state is the previous one.
-        rewards = self._rewards(step, states, running, np.where(lost[:, None], states, self.states), ending)
-        self._observations[running] = self._observe(lost)[running]
+        rewards = self._rewards(step, states, running, np.where(invalid[:, None], states, self.states), ending)
+        self._observations[running] = self._observe(invalid)[running]
         self.ended |= ending
         if ending.any():
             self.outcomes[ending] = self._outcomes(collided, at_horizon)[ending]
@@ -306,15 +304,15 @@ class Episode:
         loop = self.loop
         if at_horizon:
             return np.array(loop.so_far().outcome, dtype=object)
-        first = loop.collisions.at <= loop.records.time_of(loop.records.lost_since)
+        first = loop.collisions.at <= loop.records.time_of(loop.records.invalid_since)
         return np.where(collided & first, "collided", "diverged").astype(object)
 
-    def _observe(self, lost: Flags | None = None) -> Array:
+    def _observe(self, invalid: Flags | None = None) -> Array:
         """Measured states, and time as a fraction of the horizon; for unstable trials the last valid states."""
         loop, plan = self.loop, self._plan
         seen = np.column_stack([self._near_plan(loop.measured), np.full(len(loop.measured), loop.step / plan.steps)])
-        if lost is not None:
-            seen[lost, :-1] = self._observations[lost, :-1]
+        if invalid is not None:
+            seen[invalid, :-1] = self._observations[invalid, :-1]
         return seen
 
     def _near_plan(self, states: Array) -> Array:

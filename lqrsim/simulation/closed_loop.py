@@ -62,8 +62,8 @@ def simulate(
 ) -> Rollout:
     """Run a policy or another controller closed-loop in the plant's physics, from a plan's first state.
 
-    In each control period: read the true state, measure it, compute the control, disturb it, saturate it, apply
-    disturbing forces, step the physics, and let the state jump.
+    The first state is measured. In each control period: compute the control, disturb it, saturate it, apply disturbing
+    forces, step the physics, let the state jump, read the true state and measure it.
 
     A trial ends with its first collision, as `Collisions` defines it, when its simulation becomes unstable, when a
     disturbing force is not finite, when the filter of its controller diverges, or when the controller fails. A
@@ -101,7 +101,7 @@ def simulate(
     """
     loop = ClosedLoop(**locals())  # all arguments, by name
     loop.run()
-    return loop.rollout(undisturbed=loop.undisturbed())
+    return loop.rollout(undisturbed=True)
 
 
 def simulate_from(plant: Plant, plan: Plan, states: Array, *, knot: int = 0, **options: Any) -> Rollout:
@@ -131,7 +131,7 @@ class Records:
     Attributes:
       states, measured: (K, T+1, n). clearance: (K, T+1). commanded, applied: (K, T, m). wrench: (K, T, 6).
       contacts: (K,) number of control periods in contact.
-      lost_since: (K,) knot from which on the records are invalid; T+1 if all are valid.
+      invalid_since: (K,) knot from which on the records are invalid; T+1 if all are valid.
       failed_since: (K,) knot at which the controller failed; T+1 if it never failed.
       reasons: why each trial's controller failed, its filter diverged or a force was not finite; else empty.
       frames: arrays of MuJoCo's qpos, (K, nq) each.
@@ -148,18 +148,18 @@ class Records:
         self.clearance = zeros(steps + 1, 1)[..., 0]
         self.commanded, self.applied, self.wrench = zeros(steps, m), zeros(steps, m), zeros(steps, 6)
         self.contacts = np.zeros(trials, dtype=np.int64)
-        self.lost_since, self.failed_since = np.full(trials, steps + 1), np.full(trials, steps + 1)
+        self.invalid_since, self.failed_since = np.full(trials, steps + 1), np.full(trials, steps + 1)
         self.reasons, self.frames = [""] * trials, list[Array]()
 
-    def knot(self, step: int, states: Array, measured: Array, clearance: Array, lost: Mask) -> None:
+    def knot(self, step: int, states: Array, measured: Array, clearance: Array, invalid: Mask) -> None:
         """Record states (K, n), true and measured, and clearance (K,) at a knot, and which are invalid from here."""
         self.states[:, step], self.measured[:, step], self.clearance[:, step] = states, measured, clearance
-        if lost.any():
-            self.lost_since[lost] = np.minimum(self.lost_since[lost], step)
+        if invalid.any():
+            self.invalid_since[invalid] = np.minimum(self.invalid_since[invalid], step)
 
     def end(self, step: int, who: Literal["controller", "filter", "disturbances"], reasons: Mapping[int, str]) -> None:
         """Record that trials end, row -> reason, unless they have before; where it is the controller, they failed."""
-        over, since = self.over(step), self.failed_since if who == "controller" else self.lost_since
+        over, since = self.over(step), self.failed_since if who == "controller" else self.invalid_since
         for row, reason in reasons.items():
             if not over[row]:
                 since[row] = step
@@ -167,7 +167,7 @@ class Records:
 
     def over(self, step: int) -> Mask:
         """Whether each trial's controller has failed, or its records are invalid, at this knot or before, (K,)."""
-        return np.minimum(self.lost_since, self.failed_since) <= step
+        return np.minimum(self.invalid_since, self.failed_since) <= step
 
     def time_of(self, knots: npt.NDArray[np.int64]) -> Array:
         """The times of knots (K,) in s; infinite beyond the last one."""
@@ -188,10 +188,12 @@ class Records:
         frames = np.stack(self.frames + [np.full_like(self.frames[0], np.nan)] * missing, axis=1)
         if not self.over(steps).any():
             return frames
-        known_until = np.minimum(self.lost_since, self.failed_since + 1)  # where a controller fails, the state is known
-        driven_until = np.minimum(self.lost_since, self.failed_since)
+        known_until = np.minimum(
+            self.invalid_since, self.failed_since + 1
+        )  # where a controller fails, the state is known
+        driven_until = np.minimum(self.invalid_since, self.failed_since)
         knots = np.arange(steps + 1)
-        # A frame belongs to the knot at the end of its period: the trial was lost somewhere before that.
+        # A frame belongs to the knot at the end of its period: the trial ended somewhere before that.
         knot_of_frame = -(np.arange(frames.shape[1]) // -parts)
         for array, knot, until in (
             *((array, knots, known_until) for array in (self.states, self.measured, self.clearance)),
@@ -217,9 +219,8 @@ class Collisions:
       clearance: (K,) current signed distance to the nearest obstacle, minus the radius, in metres.
     """
 
-    def __init__(self, physics: AnyPhysics, displaced: Array, dt: float, passing: ShapeInWorld | None) -> None:
-        self._physics, self.plant, self.shape, self.dt = physics, physics.plant, physics.plant.shape, dt
-        self._passing = passing
+    def __init__(self, plant: Plant, states: Array, displaced: Array, dt: float, passing: ShapeInWorld | None) -> None:
+        self.plant, self.shape, self.dt, self._passing = plant, plant.shape, dt, passing
         moving = () if passing is None else passing.world.obstacles
         self._velocities = np.array([obstacle.velocity for obstacle in moving]).reshape(-1, 3)
         self._fastest = float(np.linalg.norm(self._velocities, axis=1).max(initial=0.0))
@@ -227,38 +228,31 @@ class Collisions:
         self.at = np.full(len(displaced), np.inf)
         self.obstacles = [""] * len(displaced)
         self._time = 0.0  # of the last places, in s
-        self._relocate(physics.state())
+        self.relocate(states)
         for row in np.flatnonzero(self.clearance < 0):
             self._hit(int(row), 0.0, self._places[row])
 
-    def detect(self, step: int, period: Period, *, ignored: Mask) -> None:
-        """Find trials, except `ignored` ones (K,), that first collide in a period; obstacles may stop them in it."""
+    def detect(self, step: int, period: Period, *, ignored: Mask) -> npt.NDArray[np.intp]:
+        """Find the trials, except `ignored` ones (K,), that first collide in a period, and return their rows."""
         begun, parts = self.at.copy(), len(period.states)
         for part, (states, touching) in enumerate(zip(period.states, period.touching, strict=True)):
             running = np.isinf(self.at) & ~ignored & (part < period.stable)
-            self._touch((step + part / parts) * self.dt, touching, running)
+            self.touch((step + part / parts) * self.dt, touching, running)
             if len(self.plant.world) or len(self._velocities):
                 self._search_line(step, part, parts, self.shape.places(states), running)
         rows = np.flatnonzero(np.isfinite(self.at) & np.isinf(begun))
         # Rounding may put a time in the period past the period's end.
         self.at[rows] = np.minimum(self.at[rows], (step + 1) * self.dt)
-        if len(rows) and isinstance(self._physics, MujocoPhysics) and self._physics.solidifies:
-            self._physics.rerun_with_contacts(rows, period)
-            self._relocate(period.states[-1])
+        return rows
 
-    def detect_at_end(self, time: float, *, ignored: Mask) -> None:
-        """Detect contacts at the last knot, which no period follows."""
-        if isinstance(self._physics, MujocoPhysics) and self._physics.senses_contacts:
-            self._touch(time, self._physics.touching_now(), np.isinf(self.at) & ~ignored)
-
-    def _touch(self, time: float, touching: Mask, running: Mask) -> None:
+    def touch(self, time: float, touching: Mask, running: Mask) -> None:
         """Record contacts that MuJoCo detected, (K, obstacles), in the `running` trials (K,)."""
-        for row in np.flatnonzero(running & touching.any(axis=1)):
+        for row in np.flatnonzero(running & np.isinf(self.at) & touching.any(axis=1)):
             self.at[row] = time
             self.obstacles[row] = self.plant.obstacles[int(np.argmax(touching[row]))]
 
-    def _relocate(self, states: Array) -> None:
-        """Replace the current states, as after obstacles have stopped some of the trials."""
+    def relocate(self, states: Array) -> None:
+        """Replace the current states (K, n), as after obstacles have stopped some of the trials."""
         self._places = self.shape.places(states)
         self.clearance = self._clear(self._places, self._time)
 
@@ -355,7 +349,7 @@ class ClosedLoop:
         self.active_disturbances = as_disturbances(self.disturbances)
         threads = check_threads(self.threads)
         self.law, plan = as_controller(self.controller, self.plan, plant.robot.dynamics)
-        self.state_coordinates, self.control_coordinates = _check_controller(self.law, plan, plant)
+        self.state_coordinates, self.control_coordinates = _checked_coordinates(self.law, plan, plant)
         full = plan.trajectory
         if self.knot >= full.steps:
             raise InputError(f"knot: got {self.knot}, want one from 0 to {full.steps - 1}, before the plan's end")
@@ -386,7 +380,7 @@ class ClosedLoop:
         self.records = Records(self.trajectory, trials)
         self.records.frames.append(self.physics.frame())
         self.states = self.physics.state()
-        self.collisions = Collisions(self.physics, self.effects.displaced, dt, passing)
+        self.collisions = Collisions(plant, self.states, self.effects.displaced, dt, passing)
         space = plant.robot.dynamics.control_coordinates
         self._names, self._limits = space.names, space.limits
         sensors = self.law.sensors
@@ -417,11 +411,14 @@ class ClosedLoop:
             while self.step < steps and self.period():
                 if self.progress is not None:
                     self.progress(self.step, steps)
-            self.detect_contacts_at_end()
 
     def period(self) -> bool:
-        """Run one control period, up to the measurement at its end. Returns False if all trials have ended."""
-        step = self.step
+        """Run one control period, up to the measurement at its end. Returns False if all trials have ended.
+
+        MuJoCo computes contacts at the beginning of a physics step, so those at the end of a period are detected in the
+        next one; at the last knot, after which nothing advances, they are detected here.
+        """
+        step, physics = self.step, self.physics
         commands = self.decide(step, self.measured)
         controls = self.actuate(step, commands)
         wrench, wind = self.push(step)
@@ -429,12 +426,14 @@ class ClosedLoop:
             return False
         self.advance(step, controls, wrench, wind)
         self.step, self.measured = step + 1, self.measure(step + 1)
+        if self.step == self.trajectory.steps and isinstance(physics, MujocoPhysics) and physics.senses_contacts:
+            self.collisions.touch(self.trajectory.horizon, physics.touching_now(), ~self.records.over(self.step))
         return True
 
     def measure(self, step: int) -> Array:
         measured = self.effects.measure(self.knot + step, self.states)
-        lost = self.physics.unstable | _not_finite(measured)
-        self.records.knot(step, self.states, measured, self.collisions.clearance, lost)
+        invalid = self.physics.unstable | _not_finite(measured)
+        self.records.knot(step, self.states, measured, self.collisions.clearance, invalid)
         over = self.records.over(step)
         if over.any():  # trials that have ended continue in the plan's states, so as not to disturb the others
             measured[over] = self.trajectory.states[step]
@@ -472,24 +471,26 @@ class ClosedLoop:
         """The disturbing forces in N and torques in N m, (K, 6), and the wind in m/s, (K, 3)."""
         wrench, wind = self.effects.push(self.knot + step, self.states)
         self.records.wrench[:, step] = wrench
-        lost = _not_finite(wrench) | _not_finite(wind)
-        if lost.any():  # MuJoCo would let such a robot stand still, without a warning
-            reasons = dict.fromkeys(np.flatnonzero(lost).tolist(), "got a force, torque or wind that is not finite")
+        invalid = _not_finite(wrench) | _not_finite(wind)
+        if invalid.any():  # MuJoCo would let such a robot stand still, without a warning
+            reasons = dict.fromkeys(np.flatnonzero(invalid).tolist(), "got a force, torque or wind that is not finite")
             self.records.end(step, "disturbances", reasons)
-            wrench[lost], wind[lost] = 0.0, 0.0
+            wrench[invalid], wind[invalid] = 0.0, 0.0
         return wrench, wind
 
     def advance(self, step: int, controls: Array, wrench: Array, wind: Array) -> None:
         """Advance the physics to the next knot. Obstacles stop a trial from the period of its first collision on.
 
         Controls, forces and wind are held over the period; a kick is of the states at its beginning, and acts at its
-        end. MuJoCo computes contacts at the beginning of a physics step, so those at the end of a period, after a kick,
-        too, are detected in the next one; at the last knot by `detect_contacts_at_end`.
+        end.
         """
         physics, records, watch = self.physics, self.records, self.watch
         over, kick = records.over(step), self.effects.kick(self.knot + step, self.states, controls)
         period = physics.advance(controls, wrench, wind, kick)
-        self.collisions.detect(step, period, ignored=over)
+        begun = self.collisions.detect(step, period, ignored=over)
+        if len(begun) and isinstance(physics, MujocoPhysics) and physics.solidifies:
+            physics.rerun_with_contacts(begun, period)
+            self.collisions.relocate(period.states[-1])
         if physics.solid.any():
             records.contacts += physics.touched(period) & ~over
         self.states = period.states[-1]
@@ -499,10 +500,6 @@ class ClosedLoop:
             if watch is not None:
                 watch(time, frame, physics.unstable)
 
-    def detect_contacts_at_end(self) -> None:
-        """Detect contacts at the last knot, which no period follows."""
-        self.collisions.detect_at_end(self.trajectory.horizon, ignored=self.records.lost_since <= self.trajectory.steps)
-
     def so_far(self) -> Rollout:
         """A Rollout of the records so far, as if the controller had failed now. The loop can continue."""
         twin = copy.copy(self)
@@ -511,7 +508,7 @@ class ClosedLoop:
             twin.records.end(self.step, "controller", dict.fromkeys(range(self.trials), "went no further"))
         return twin.rollout()
 
-    def undisturbed(self) -> Array | None:
+    def run_undisturbed(self) -> Array | None:
         """States (T+1, n) of the plan's own policy without disturbances, NaN once that run has ended; None if unknown.
 
         A run of that policy that is undisturbed itself is that run. Where the plan is of MuJoCo's own steps, which the
@@ -522,7 +519,7 @@ class ClosedLoop:
             return None
         if not self.active_disturbances and self.law.digest == plan.policy.digest:
             records.turn_to_plan(self.state_coordinates)
-            ended = min(self.collisions.at[0], records.time_of(records.lost_since)[0])
+            ended = min(self.collisions.at[0], records.time_of(records.invalid_since)[0])
             return np.where(plan.trajectory.times[:, None] < ended, records.states[0], np.nan)
         if not plant.robot.dynamics.by_mujoco or plant.simulator is not None:
             return None
@@ -535,16 +532,17 @@ class ClosedLoop:
             plant.ran = (*which, alone.undisturbed)
         return plant.ran[2]
 
-    def rollout(self, *, undisturbed: Array | None = None) -> Rollout:
-        """A Rollout of all records, with the states of an undisturbed run."""
+    def rollout(self, *, undisturbed: bool = False) -> Rollout:
+        """A Rollout of all records; if asked for, with the states of an undisturbed run."""
+        alone = self.run_undisturbed() if undisturbed else None
         records, collisions = self.records, self.collisions
         plant, plan, parts = self.plant, self.trajectory, self.physics.drawn_parts
         goal, radius = self.remaining_plan.goal, self._radius
         if (moved := self.controller_run.moved_goal()) is not None:
             # A radius that was given holds for another goal only in the same unit.
             target = replace(self._target, goal=moved)
-            stated = (self.goal_radius, self.goal_tolerance) if target.unit == self._target.unit else (None, None)
-            goal, radius = moved, target.radius(plant.robot.radius, *stated)
+            given = (self.goal_radius, self.goal_tolerance) if target.unit == self._target.unit else (None, None)
+            goal, radius = moved, target.radius(plant.robot.radius, *given)
         described = (disturbance.describe(plant) for disturbance in self.active_disturbances)
         changed = () if moved is None else (GOAL_MOVED,)
         begun = () if self.starts is None else ("given first states",)
@@ -558,13 +556,13 @@ class ClosedLoop:
             measured=records.measured, commanded=records.commanded, applied=records.applied,
             forces=records.wrench[..., :3], torques=records.wrench[..., 3:], displaced=self.effects.displaced,
             clearance=records.clearance, contacts=records.contacts, collided_at=collisions.at,
-            obstacles=tuple(collisions.obstacles), diverged_at=records.time_of(records.lost_since),
+            obstacles=tuple(collisions.obstacles), diverged_at=records.time_of(records.invalid_since),
             failed_at=records.time_of(records.failed_since), reasons=tuple(records.reasons), frames=frames,
             frame_times=np.arange(frames.shape[1]) * (plan.dt / parts), seed=self.seed, first_trial=self.first_trial,
             disturbances=(*described, *begun, *passing, *changed), controller_run=self.controller_run,
             versions={**versions(), **({} if plant.simulator is None else plant.simulator.versions)},
             balls=plant.record_of_balls(plan.states, records.states) if self.frames else None,
-            obstacle_geoms=plant.obstacle_geoms, undisturbed=undisturbed,
+            obstacle_geoms=plant.obstacle_geoms, undisturbed=alone,
             warnings=self.physics.warnings if plant.simulator is None else None,
             moving=MovingObstacles.of(self.moving.moved(self.knot * plan.dt)) if self.moving else None,
         )  # fmt: skip
@@ -578,7 +576,7 @@ def _not_finite(rows: Array) -> Mask:
     return ~np.all(finite, axis=1)
 
 
-def _check_controller(controller: Controller, plan: Plan, plant: Plant) -> tuple[Coordinates, Coordinates]:
+def _checked_coordinates(controller: Controller, plan: Plan, plant: Plant) -> tuple[Coordinates, Coordinates]:
     """The coordinates of the controller's states and controls; InputError unless they and the plan fit the robot's."""
     dynamics, kind = plant.robot.dynamics, type(controller).__name__
     check_string(f"{kind}.digest", controller.digest, LINE)
