@@ -38,6 +38,7 @@ from lqrsim.results.goal import OF_RANGE, OF_WAY, OUTCOMES, Target
 from lqrsim.robots.base import Robot
 from lqrsim.scenarios.references import disturbance_set
 from lqrsim.scenes.scene import scene_from_xml
+from lqrsim.simulation.closed_loop import simulate_from
 from lqrsim.simulation.effects import tube_under
 from lqrsim.simulation.plant import Plant
 from lqrsim.stress.analysis import Outcomes, outcomes
@@ -135,6 +136,20 @@ def test_an_arm_that_is_stuck_on_a_post_has_collided_with_it(arm: Plant, swing: 
         assert rollout.states[0, -1, 0] > np.pi / 2
         assert rollout.contacts[0] == 0
     assert not arm.enclosed
+
+
+@pytest.mark.parametrize("others", range(3))
+def test_where_a_controller_has_failed_nothing_collides(arm: Plant, others: int) -> None:
+    """It fails at once for an arm that begins in the post, with others that go on or alone; then that is all of it."""
+    plan = track(arm.robot, (0.0, 0.0), np.zeros((5, 1)), 0.05, feedback=False)
+    starts = np.zeros((1 + others, 2))
+    starts[0, 0] = np.pi / 4
+    for fails in (True, False):
+        rollout = simulate_from(
+            arm, plan, starts, contacts=False, controller=lambda x, t, fails=fails: [np.nan if fails and x[0] else 0.0]
+        )
+        assert rollout.outcome[0] == ("error" if fails else "collided")
+        assert rollout.collided_at[0] == (np.inf if fails else 0.0)
 
 
 @pytest.mark.parametrize("seed", range(4))
