@@ -57,7 +57,7 @@ from .scenes.scene import load_scene as load_scene
 from .scenes.world import Obstacle as Obstacle
 from .scenes.world import World as World
 from .simulation.closed_loop import simulate as simulate
-from .simulation.effects import uncertainty_of as uncertainty_of
+from .simulation.disturbances import uncertainty_of as uncertainty_of
 from .simulation.plant import Plant as Plant
 from .simulation.plant_check import check_plant as check_plant
 from .solvers.gradients import gradients as gradients

@@ -21,8 +21,7 @@ from lqrsim.errors import Array, InputError, check_path
 from lqrsim.results.archive import write_text
 from lqrsim.results.goal import OUTCOMES, Target, tracking_unit
 from lqrsim.scenarios.packaged import Scenario
-from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.simulation.effects import uncertainty_of
+from lqrsim.simulation.disturbances import Disturbance, uncertainty_of
 from lqrsim.stress import analysis
 from lqrsim.stress.results import Results, replay
 from lqrsim.stress.statistics import Estimate

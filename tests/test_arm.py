@@ -10,11 +10,11 @@ import pytest
 from planar_arm import LINK, PlanarArm
 
 import lqrsim as ls
+from lqrsim.commands.solving import tube_under
 from lqrsim.control.prediction import Surroundings
 from lqrsim.disturbances import ControlNoise, DisplacedObstacles
 from lqrsim.errors import Array
 from lqrsim.results.goal import OF_WAY
-from lqrsim.simulation.effects import tube_under
 
 pytestmark = pytest.mark.long  # test_balls.py has what is quick of robots of several balls
 

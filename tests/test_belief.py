@@ -15,10 +15,10 @@ from sympy import Matrix, cos, sin, sqrt
 
 import lqrsim as ls
 from lqrsim.codegen.plain import plain_functions
+from lqrsim.commands.solving import tube_under
 from lqrsim.errors import Array
 from lqrsim.problem.problem import PlainTerm
 from lqrsim.results.solution_parts import Status
-from lqrsim.simulation.effects import tube_under
 from lqrsim.view.plots import accuracy
 
 DT = 0.1

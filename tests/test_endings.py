@@ -21,6 +21,7 @@ from tracking import hover, track
 
 import lqrsim as ls
 from lqrsim.cli import main
+from lqrsim.commands.solving import tube_under
 from lqrsim.control.controllers import Controller, ControllerRun, Feedback
 from lqrsim.disturbances import (
     ControlNoise,
@@ -39,7 +40,6 @@ from lqrsim.robots.base import Robot
 from lqrsim.scenarios.references import disturbance_set
 from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.simulation.closed_loop import simulate_from
-from lqrsim.simulation.effects import tube_under
 from lqrsim.simulation.plant import Plant
 from lqrsim.stress.analysis import Outcomes, outcomes
 from lqrsim.stress.campaign import run_campaign

@@ -27,6 +27,7 @@ from sampling import examples, rarely
 import lqrsim as ls
 from lqrsim.codegen.language import Group
 from lqrsim.codegen.printer import Value
+from lqrsim.commands.solving import tube_under
 from lqrsim.disturbances import Uncertainty
 from lqrsim.errors import (
     LONGEST,
@@ -44,7 +45,6 @@ from lqrsim.errors import (
 from lqrsim.machine import memory
 from lqrsim.problem.parts import CostTerm
 from lqrsim.results.solution_parts import BetweenKnots
-from lqrsim.simulation.effects import tube_under
 from lqrsim.stress import Campaign
 from lqrsim.stress.statistics import rate
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import lqrsim as ls
+from lqrsim.commands.solving import tube_under
 from lqrsim.disturbances import ControlDelay, ControlNoise, MeasurementLatency, MeasurementNoise, Push
-from lqrsim.simulation.effects import tube_under
 
 NOISE = ControlNoise(0.05)
 

@@ -481,4 +481,4 @@ def test_a_system_without_the_parameter_has_another_law() -> None:
     np.testing.assert_allclose(
         told.step([1.0], [0.0], DT), system.A @ [1.0] + 0.25 * system.E[:, 0], rtol=0, atol=1e-12
     )
-    assert replace(STATED, loss=0.1).steady(np.inf).loss == 0.1
+    assert replace(STATED, loss=0.1).as_stated().loss == 0.1

@@ -8,6 +8,7 @@ import math
 import shlex
 import shutil
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -19,6 +20,7 @@ from lqrsim.commands import console
 from lqrsim.commands.options import ControllerName, DesignSet, Folder, Json, arguments_for, optional, options_of, refuse
 
 if TYPE_CHECKING:
+    from lqrsim.control.controllers import ControllerLike
     from lqrsim.solvers.settings import StartLike
 
 
@@ -220,10 +222,39 @@ class Solve:
         return None if self.starts is not None else scenario.start
 
 
+def tube_under(
+    problem: "ls.Problem", solution: "ls.Solution", plant: "ls.Plant",
+    disturbances: "Sequence[ls.disturbances.Disturbance]", controller: "ControllerLike | None" = None,
+) -> "tuple[ls.types.Tube | None, str]":  # fmt: skip
+    """The predicted tube of a run, if there is one, and a line on what it leaves out, or why there is none.
+
+    Without disturbances there is neither a tube nor a line.
+    """
+    import numpy as np
+
+    from lqrsim.problem.belief import Belief
+
+    if not disturbances:
+        return None, ""
+    try:
+        uncertainty = None if isinstance(problem.dynamics, Belief) else ls.uncertainty_of(plant, disturbances)
+        if not problem.dynamics.state_coordinates.position:
+            raise ls.InputError("the robot has no position")
+        with np.errstate(over="ignore", invalid="ignore"):  # an unstable loop overflows; it is refused below
+            tube = ls.predict_tube(problem, solution, uncertainty, controller)
+        if not np.isfinite(tube.covariance).all():
+            raise ls.InputError("the loop is not stable, its covariance is not finite")
+    except ls.InputError as error:
+        return None, f"no predicted tube: {error}"
+    if uncertainty is None:
+        return tube, "the predicted tube has the noise and the readings of the plan, and no other disturbances"
+    left_out = uncertainty.left_out
+    return tube, f"the predicted tube leaves out {'; '.join(left_out)}" if left_out else ""
+
+
 def _plot_policy(scenario: "ls.Scenario", solution: "ls.Solution", path: Path) -> "ls.types.Tube | None":
     """Plot the policy of a solution of a scenario, which has its duration. Returns the tube, if one is predicted."""
     from lqrsim.problem.belief import Belief
-    from lqrsim.simulation.effects import tube_under
 
     tube, remark = tube_under(scenario.problem, solution, scenario.plant(), scenario.disturbances)
     if remark:
@@ -284,7 +315,6 @@ class Simulate:
 
     def run(self) -> int:
         from lqrsim.scenarios.references import disturbance_set
-        from lqrsim.simulation.effects import tube_under
         from lqrsim.stress.study import DEFAULT_DESIGN, DESIGNED, check_designed, make_controller
 
         if self.open_loop and self.controller != "feedback":

@@ -394,7 +394,7 @@ class OffsetFree(Controller):
         stated = self.uncertainty if uncertainty is None else uncertainty
         check_kind("uncertainty", stated, Uncertainty, "an Uncertainty, such as uncertainty_of(...), or None")
         stated.check(self.problem.dynamics)
-        truth = PlanModel(self.model.derivatives, stated.steady(np.inf))
+        truth = PlanModel(self.model.derivatives, stated.as_stated())
         offset = self.offset - self.solution.trajectory.controls
         offset = offset + np.einsum("tij,tj->ti", self.gain, self.nominal[:-1])
         return LinearLoop(truth, self.gain, offset, self.filter.gain, self.coordinates[1].limits, self.model)
@@ -451,7 +451,7 @@ def robust_to_lag(
       stated: the true uncertainty, with the stated lag. memory, effort: as in `assumed_model`.
       at_end: as in `tolerances_to_try`, whose tolerances compete; None to keep those of the design.
     """
-    solution, derivatives, uncertainty = judge.solution, design.model.derivatives, stated.steady(np.inf)
+    solution, derivatives, uncertainty = judge.solution, design.model.derivatives, stated.as_stated()
     # Without losses of commands, a model without a lag has no actuators' states. One with the shortest lag has them.
     no_lag = 0.0 if uncertainty.command_loss else np.finfo(np.float64).tiny
     systems = [PlanModel(derivatives, replace(uncertainty, lag=lag)) for lag in (uncertainty.lag, no_lag)]

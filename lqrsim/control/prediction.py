@@ -333,7 +333,7 @@ def sample_loop(
     displaced = surroundings.displacements(robots.rng, trials)
     collided, farthest = np.zeros(trials, dtype=bool), np.zeros(trials)
     states, commands = np.empty((plan.steps + 1, trials, n)), np.empty((plan.steps, trials, model.m))
-    with np.errstate(over="ignore", invalid="ignore"):  # of lost trials
+    with np.errstate(over="ignore", invalid="ignore"):  # of trials that diverge
         for t in range(plan.steps + 1):
             states[t] = robots.states(t)
             finite = np.isfinite(states[t]).all(axis=1)

@@ -145,8 +145,7 @@ class Uncertainty:
         assumes a wind of mean zero is biased for a steady wind.
 
         Args:
-          memory: seconds in which a constant may wander by its standard deviation. With np.inf constants do not change,
-            and what varies has the mean zero: the same uncertainty, with its unknowns in the order of a filter's.
+          memory: seconds in which a constant may wander by its standard deviation; np.inf for `as_stated`.
         """
         memory = check_seconds("memory", memory, above=0.0)
         mean_std = 0.0 if memory == np.inf else MEAN_STD
@@ -159,6 +158,10 @@ class Uncertainty:
             drift = float(np.hypot.reduce([unknown.drift for unknown in same if unknown.constant] or [0.0]))
             merged.append(Unknown(same[0].of, std, drift=max(drift, std / np.sqrt(memory))))
         return replace(self, unknowns=(*merged, *(unknown for unknown in self.unknowns if not unknown.constant)))
+
+    def as_stated(self) -> "Uncertainty":
+        """The same, with its unknowns in the order of a filter's: constants stay, and what varies has the mean zero."""
+        return self.steady(np.inf)
 
 
 def possible_unknowns(dynamics: Dynamics) -> list[str]:

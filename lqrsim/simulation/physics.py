@@ -283,8 +283,8 @@ class SimulatorPhysics(Physics):
     def _read_states(self) -> None:
         """Read the states. A state with an entry that is not finite becomes NaN."""
         self._states = states_of(self._simulator, self._simulations, self._states.shape)
-        lost = ~np.isfinite(self._states).all(axis=1)
-        self._states[lost], self.unstable[lost] = np.nan, True
+        diverged = ~np.isfinite(self._states).all(axis=1)
+        self._states[diverged], self.unstable[diverged] = np.nan, True
 
     def state(self) -> Array:
         return self._states.copy()

@@ -38,8 +38,7 @@ from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
 from lqrsim.simulation.closed_loop import simulate
-from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.simulation.effects import uncertainty_of
+from lqrsim.simulation.disturbances import Disturbance, uncertainty_of
 from lqrsim.simulation.plant import Plant
 from lqrsim.solvers.compiled import costs_of
 from lqrsim.solvers.smoother import smooth

@@ -34,8 +34,7 @@ from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import disturbance_set, from_anywhere, resolve
 from lqrsim.simulation.closed_loop import simulate
-from lqrsim.simulation.disturbances import Disturbance
-from lqrsim.simulation.effects import uncertainty_of
+from lqrsim.simulation.disturbances import Disturbance, uncertainty_of
 
 _log = logging.getLogger("lqrsim")
 

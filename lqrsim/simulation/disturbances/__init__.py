@@ -1,15 +1,19 @@
 """Disturbances of a run: one class each, in physical units, drawn for each trial from its own generator.
 
 `base.py` explains how to add one; `KINDS` has all classes by name. Presets are named sets of them, from calm to severe;
-a plant gets only those that it supports.
+a plant gets only those that it supports. `uncertainty_of` has disturbances in the form that filters, tracking laws and
+predicted tubes use.
 """
 
 import inspect
+from collections.abc import Sequence
 
 import numpy as np
 
 from lqrsim.annotations import checked
-from lqrsim.errors import InputError, check_name
+from lqrsim.control.uncertainty import Uncertainty, gathered
+from lqrsim.errors import InputError, check_kind, check_name
+from lqrsim.problem.noise import Noise
 from lqrsim.simulation.disturbances.actuation import (
     ActuatorLoss,
     CommandDropouts,
@@ -117,3 +121,27 @@ def _affects(disturbance: Disturbance, plant: Plant) -> bool:
     except InputError:
         return False
     return not isinstance(disturbance, GaussianDisturbance) or bool(np.any(np.asarray(disturbance.std)))
+
+
+@checked
+def uncertainty_of(plant: Plant, disturbances: Sequence[Disturbance | Noise]) -> Uncertainty:
+    """Convert disturbances to zero-mean Gaussian uncertainty. Disturbances that do not fit are left out, by name.
+
+    A fixed value (`MeanWind`, the `factor` of a mismatch) counts as unknown, with its size as standard deviation. A
+    truncated normal distribution counts with its own standard deviation. Losses in bursts count as independent ones,
+    and displaced obstacles as displaced equally along all axes. `left_out` lists, with reasons, the disturbances that
+    the robot's dynamics do not declare, and all that are not small, lasting and linear: pushes, narrower limits, the
+    loss of an actuator.
+
+    Args:
+      disturbances: as in `simulate`; your own kinds have a method `uncertainty`.
+    """
+    parts = list[Uncertainty]()
+    for disturbance in as_disturbances(disturbances):
+        disturbance.check(plant)
+        field = f"{type(disturbance).__name__}: uncertainty"
+        wanted = "a method that returns an Uncertainty"
+        parts.append(check_kind(field, disturbance.uncertainty(plant), Uncertainty, wanted))
+    total = gathered(parts)
+    total.check(plant.robot.dynamics)
+    return total
