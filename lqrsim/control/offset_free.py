@@ -112,15 +112,11 @@ def assumed_model(
 def check_observable(model: PlanModel) -> None:
     """Raise InputError that names an unknown, if it moves the robot but changes no measurement of the plan's model."""
     first = model.n + model.lagging
-    H, effect, groups = (
-        model.derivatives.H,
-        np.eye(model.size)[:, first:],
-        [list(indices) for indices in model.unknown_states],
-    )
+    effect, groups = np.eye(model.size)[:, first:], [list(indices) for indices in model.unknown_states]
     moved, seen = np.zeros(model.size - first), np.zeros(model.size - first)
     for t in range(model.plan.steps + 1):
         moved = np.maximum(moved, np.abs(effect[: model.n]).max(axis=0, initial=0.0))
-        seen = np.maximum(seen, np.abs(H[t] @ effect[: model.n]).max(axis=0, initial=0.0))
+        seen = np.maximum(seen, np.abs(model.derivatives.H[t] @ effect[: model.n]).max(axis=0, initial=0.0))
         if all(seen[group].any() for group in groups):
             return
         if t < model.plan.steps:
