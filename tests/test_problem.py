@@ -52,6 +52,21 @@ def test_a_sum_is_scaled_ahead_and_by_knot_as_its_terms() -> None:
             getattr(summed, what)
 
 
+@settings(max_examples=examples(3))
+@given(about=st.tuples(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0)), weight=st.floats(0.5, 20.0))
+def test_a_soft_start_by_name_is_known_with_rates(about: tuple[float, float], weight: float) -> None:
+    named = ls.QuadraticCost({"x": weight, "y": weight}, about=dict(zip(("x", "y"), about, strict=True)))
+    solutions = []
+    for initial in (named, ls.QuadraticCost([weight, weight], about=about)):
+        stated = ls.Problem(
+            dynamics=_two(), dt=0.1, steps=5, initial=initial, stage_cost=ls.ControlCost([1.0]),
+            final_cost=ls.QuadraticCost([1.0, 1.0], about=[0.0, 0.0]), control_rate=ls.ControlRate(weight=0.1),
+        )  # fmt: skip
+        np.testing.assert_array_equal(with_last_command(stated).start, [*about, 0.0])
+        solutions.append(ls.smooth(stated))
+    np.testing.assert_array_equal(*(solution.trajectory.controls for solution in solutions))
+
+
 def _two(**fields: Any) -> ls.Dynamics:
     return ls.Dynamics(_double, states={"x": "", "y": ""}, controls={"u": ""}, **fields)
 
