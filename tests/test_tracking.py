@@ -630,6 +630,22 @@ def test_it_warns_if_no_law_brings_the_model_back(caplog: pytest.LogCaptureFixtu
     assert "track(...): each law that was tried loses the plan from some deviations" in caplog.text
 
 
+@pytest.mark.parametrize("rate", [20.0, 60.0])
+@pytest.mark.parametrize("law", [ls.track, ls.OffsetFree])
+def test_it_warns_if_the_moments_of_all_laws_overflow(law: Any, rate: float, caplog: pytest.LogCaptureFixture) -> None:
+    """Limits are too narrow for what is unstable: variances grow by e^(rate / 5) in each of 600 steps."""
+    dynamics = ls.Dynamics(
+        lambda x, u, p: [rate * x[0] + u[0]], states={"x": "m"}, controls={"u": "N"}, control_limits=(-1, 1)
+    )
+    problem = ls.Problem(
+        dynamics=dynamics, dt=0.1, steps=600, initial=ls.FixedState((0.0,)), stage_cost=ls.ControlCost((1.0,)),
+        final_cost=ls.QuadraticCost((1.0,), about=(0.0,)),
+    )  # fmt: skip
+    chosen = law(problem, ls.smooth(problem), uncertainty=Uncertainty(start=1.0, measurement=0.1))
+    assert np.isfinite(chosen.gain).all()
+    assert "each law that was tried loses the plan from some deviations" in caplog.text
+
+
 @pytest.mark.parametrize("std", [2.0, pytest.param(1.0, marks=pytest.mark.long)])
 def test_a_law_that_limits_and_a_wrong_parameter_defeat_is_not_chosen(std: float) -> None:
     """A reaction a -> b -> c that runs away if it is heated, with one rate that is not known: what is made of b.

@@ -231,16 +231,19 @@ class Judge:
 
     def moments(self, laws: Laws) -> LoopMoments:
         """The moments of the states under C laws, (C, ...)."""
-        if self.filter is not None:
-            return with_filter(self.truth, self.filter, *laws, self.limits)
         n = self.truth.n
-        return LinearLoop(self.truth, laws.gain[..., :n], laws.offset, None, self.limits).moments(n)
+        with np.errstate(over="ignore", invalid="ignore"):  # loops that are not stable
+            if self.filter is not None:
+                return with_filter(self.truth, self.filter, *laws, self.limits)
+            return LinearLoop(self.truth, laws.gain[..., :n], laws.offset, None, self.limits).moments(n)
 
     def predictions(self, moments: LoopMoments) -> Predictions:
-        """What follows from moments of the states, (..., T+1, n) and so on. Those that are not finite become 0."""
+        """What follows from moments of the states, (..., T+1, n) and so on: the worst if they are not finite."""
         finite = np.isfinite(moments.covariance).all(axis=(-3, -2, -1))
-        for moment in moments:
-            moment[~finite] = 0.0
+        if not finite.all():
+            moments = LoopMoments(*(moment.copy() for moment in moments))
+            for moment in moments:
+                moment[~finite] = 0.0
         mean, covariance, plan = moments.mean, moments.covariance, self.solution.trajectory
         collide = self.surroundings.spread(plan.states + mean, covariance, moments.across).chance()[1]
         width = np.sqrt((self.norm.squares(covariance) + self.norm(mean) ** 2).mean(axis=-1))
