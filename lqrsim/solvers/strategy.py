@@ -70,6 +70,7 @@ class Runs:
 
     Attributes:
       allowed: the largest violation of a constraint. known: what the runs know of one another.
+      finished: the runs that ended, with their results, the best first.
     """
 
     def __init__(self, problem: Problem, settings: SmootherSettings, stop: Stop) -> None:
@@ -79,9 +80,8 @@ class Runs:
         self.finished: list[tuple[SolveRun, RunResult]] = []
 
     @property
-    def best(self) -> tuple[SolveRun, RunResult]:
-        """The run with the best result so far, and that result."""
-        return self.finished[0]
+    def best(self) -> RunResult:
+        return self.finished[0][1]
 
     def another(self, start: Start, problem: Problem | None = None) -> SolveRun:
         """A run from another start, perhaps of another problem."""
@@ -119,7 +119,7 @@ class Runs:
 
     def cheaper_elsewhere(self, less: float) -> int | None:
         """Number of the cheapest plan that keeps the constraints, if it costs less than the best by this share."""
-        allowed, best = self.allowed, self.best[1].cost
+        allowed, best = self.allowed, self.best.cost
         kept = [result.violation <= allowed and np.isfinite(result.cost) for _, result in self.finished]
         costs = np.where(kept, [result.cost for _, result in self.finished], np.inf)
         return int(np.argmin(costs)) if costs.min() < best - less * abs(best) else None
@@ -168,13 +168,13 @@ class Search:
             too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self.runs.named)
             if self._problem.risk > 0 and too_high and self.may_go_on:
                 self.retry_without_risk()
-            if self._default and self.may_go_on and (self._approaches.left_alone or not self.runs.best[1].success):
+            if self._default and self.may_go_on and (self._approaches.left_alone or not self.runs.best.success):
                 self._softening.soften()
             if given is not None:
                 self.keep_given(given)
-            if not self.runs.best[1].success and self.may_go_on:
+            if not self.runs.best.success and self.may_go_on:
                 self._softening.alternate()
-            if not self.runs.best[1].success and self.may_go_on:
+            if not self.runs.best.success and self.may_go_on:
                 self._softening.leave_contact_modes()
         solution = self._solution()
         for run in begun:
@@ -184,7 +184,7 @@ class Search:
     def choose_start(self) -> tuple[SolveRun, RunResult]:
         """Finish the most promising of the given starts, and of others where it leads to a poor plan; the best run."""
         self.finish_promising()
-        lost = not np.isfinite(self.runs.best[1].cost) and self.runs.best[1].status is not Status.RISK_TOO_HIGH
+        lost = not np.isfinite(self.runs.best.cost) and self.runs.best.status is not Status.RISK_TOO_HIGH
         if lost and self._problem.start is not None and not self._stop.due:
             self.try_finite()
         if self.needs_others and self.is_barred:
@@ -195,7 +195,7 @@ class Search:
             self.try_elsewhere()
         if self.needs_others and not self._guided:
             self.try_sinusoidal_controls()
-        return self.runs.best
+        return self.runs.finished[0]
 
     def finish_promising(self) -> None:
         """Finish the most promising run; with constraints, also the others, as long as they may cost less."""
@@ -213,7 +213,7 @@ class Search:
         # Constraints can make the best route the worst, or close it. The costs of the other runs so far, without
         # constraints, are approximate lower bounds on their costs with constraints.
         for run in sorted(others, key=lambda run: run.cost):
-            best = self.runs.best[1]
+            best = self.runs.best
             if self._stop.due or best.final or (best.success and not run.cost < best.cost):
                 break
             self.runs.offer(run, self.runs.result_of(run))
@@ -236,7 +236,7 @@ class Search:
     def try_finite(self) -> None:
         """Where states leave their domain, try constant controls under which they do not, and a line of states."""
         self.runs.known.from_start = False
-        problem, work, plans = self._problem, self.runs.best[0].work, list[tuple[float, float, Array]]()
+        problem, work, plans = self._problem, self.runs.finished[0][0].work, list[tuple[float, float, Array]]()
         for control, plan in multistart.constant_controls(problem):
             missed = float(f"{work.violation_of(plan):.2g}")
             cost = compiled.cost_of(problem, *plan)
@@ -244,9 +244,9 @@ class Search:
                 plans.append((missed, cost, control))
         for _, _, control in sorted(plans, key=lambda entry: entry[:2])[:CONSTANT]:
             self.runs.try_from(f"the constant controls {', '.join(f'{u:.3g}' for u in control)}", control)
-            if self.runs.best[1].success or self._stop.due:
+            if self.runs.best.success or self._stop.due:
                 return
-        if self._exact and not np.isfinite(self.runs.best[1].cost):
+        if self._exact and not np.isfinite(self.runs.best.cost):
             self.runs.try_from("a line of states", line_of_states(problem), from_states)
 
     def try_reweighted(self) -> None:
@@ -266,7 +266,7 @@ class Search:
             if stop.due:
                 return
             run = self.runs.add(guess_from(heaviest, f"a plan for {times:g} times the weight of obstacles and goal"))
-            result, best = self.runs.result_of(run, refine), self.runs.best[1]
+            result, best = self.runs.result_of(run, refine), self.runs.best
             # The same optimum, different within the tolerances, is no improvement.
             lower = not best.success or result.cost < best.cost - 1e-3 * abs(best.cost)
             self.runs.offer(run, result, better=result.rank < best.rank and lower)
@@ -277,10 +277,10 @@ class Search:
         problem = self._problem
         if self._exact:
             self._follow_ways()
-        motions = dict[str, StartLike](self._motions()) if self._exact and not self.runs.best[1].success else {}
+        motions = dict[str, StartLike](self._motions()) if self._exact and not self.runs.best.success else {}
         sways = {sinusoidal_name(cycles): sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]}
         for name, start in (motions | sways).items():
-            if self._stop.due or self.runs.best[1].success:
+            if self._stop.due or self.runs.best.success:
                 break
             self.runs.known.from_start = False
             # A trajectory is on one side of the obstacles; smoothing without the constraints would leave this side. The
@@ -291,7 +291,7 @@ class Search:
     def _follow_ways(self) -> None:
         """Begin with ways of states, whatever a rollout does; all of them, because it is not known which is best."""
         problem = self._problem
-        for way in list(multistart.ways(problem, self.runs.best[0].stages)):
+        for way in list(multistart.ways(problem, self.runs.finished[0][0].stages)):
             if self._stop.due:
                 return
             self.runs.known.from_start = False
@@ -318,12 +318,12 @@ class Search:
     def grow_trees(self) -> None:
         for seed, way in ways_by_trees(self._problem, self._stop):
             self.runs.try_from(f"trees of short plans, seed {seed}", way, from_states)
-            if self.runs.best[1].success:
+            if self.runs.best.success:
                 return
 
     def _motions(self) -> list[tuple[str, Trajectory]]:
         """Trajectories along paths from start to goal, by name; the least violation of constraints first."""
-        problem, cost = self._problem, self.runs.best[1].cost
+        problem, cost = self._problem, self.runs.best.cost
         motions = list[tuple[float, str, Trajectory]]()
         for name, prior in multistart.along_paths(problem, self._steered(), cost if 0 < cost < np.inf else 1.0).items():
             if self._stop.due:
@@ -338,7 +338,7 @@ class Search:
 
     def _steered(self) -> list[int]:
         """The states that place the robot: its position, or else states on which constraints to be passed depend."""
-        problem, work, moving = self._problem, self.runs.best[0].work, set[int]()
+        problem, work, moving = self._problem, self.runs.finished[0][0].work, set[int]()
         position = list(problem.dynamics.state_coordinates.position)
         if position or problem.start is None or problem.goal is None:
             return position
@@ -353,14 +353,14 @@ class Search:
         runs = [self.runs.another(sinusoidal_controls(self._problem, cycles)) for cycles in SWAYS]
         chosen = choose(runs, self._stop.threads)[0]
         self.runs.named.append((sinusoidal_name(SWAYS[runs.index(chosen)]), chosen))
-        result, best = self.runs.result_of(chosen, known=Known()), self.runs.best[1]
+        result, best = self.runs.result_of(chosen, known=Known()), self.runs.best
         # Even a plan that has not converged is better than doing nothing.
         self.runs.offer(chosen, result, better=result.violation <= best.violation and result.cost < best.cost)
         self.tried = not self._stop.due
 
     def try_detours(self) -> None:
         """If the best plan touches a constraint that may be passed on another side, finish plans from such paths."""
-        touched = itertools.compress(self.runs.best[1].multipliers, passable(self._problem))
+        touched = itertools.compress(self.runs.best.multipliers, passable(self._problem))
         if not any(multipliers.values.any() for multipliers in touched):
             return
         tried = {name for name, _ in self.runs.named}
@@ -374,7 +374,7 @@ class Search:
         A saddle that is not left has not converged, and comes after a plan from elsewhere that costs less.
         """
         for count in range(SADDLES + 1):
-            run, best = self.runs.best
+            run, best = self.runs.finished[0]
             if best.certificate is None or best.certificate.curvature is not Curvature.SADDLE:
                 return
             if count == SADDLES or not self._descend(run, best):
@@ -411,7 +411,7 @@ class Search:
 
     def keep_given(self, given: RunResult) -> None:
         """If the best plan is worse than the caller's, or has left what that moved, descend from the caller's plan."""
-        run, best = self.runs.best
+        run, best = self.runs.finished[0]
         still = _differ(best, given, self._approaches.unmoved())
         worsened = still or best.is_worse(given, run.work) or _goal_left(self._problem, best, given)
         if worsened and not self._stop.due:
@@ -419,7 +419,7 @@ class Search:
             other = self.runs.result_of(run, refine)
             wanted = best.is_worse(given, run.work) or (still and other.cost < best.cost) or other.rank < best.rank
             self.runs.offer(run, other, better=wanted and not other.is_worse(given, run.work))
-        run, best = self.runs.best
+        run, best = self.runs.finished[0]
         if best.is_worse(given, run.work):
             status = Status.TIME_LIMIT if self._stop.due else Status.STALLED
             detail = "no plan was found that is better than the given one, which is returned"
@@ -439,10 +439,10 @@ class Search:
         run = self.runs.add(replace(begin, cost_to_go=plan.values["cost_to_go"], multipliers=plan.multipliers))
         result = self.runs.result_of(run)
         # Of plans whose risk is too high, this one is near an optimum.
-        self.runs.offer(run, result, better=result.rank <= self.runs.best[1].rank)
+        self.runs.offer(run, result, better=result.rank <= self.runs.best.rank)
 
     def _solution(self) -> Solution:
-        chosen, result = self.runs.best
+        chosen, result = self.runs.finished[0]
         problem, settings, stop = self._problem, self._settings, self._stop
         if not np.isfinite(result.states).all() and not result.success:
             result = replace(result, status=Status.NOT_FINITE, detail=left_domain(problem, result))
@@ -486,18 +486,18 @@ class Search:
     @property
     def _cut_short(self) -> bool:
         """Whether other starts or softer contacts may still make a failed plan better, but no time is left for them."""
-        if self.runs.best[1].success or not (self._default and self._settings.safeguard and self._stop.due):
+        if self.runs.best.success or not (self._default and self._settings.safeguard and self._stop.due):
             return False
         if not self.tried and self._is_unacceptable:
             return True
         return bool(self._softening.problems) or any(
-            True for _ in self._problem.dynamics.softened(self.runs.best[1].states)
+            True for _ in self._problem.dynamics.softened(self.runs.best.states)
         )
 
     @property
     def is_poor(self) -> bool:
         """Whether other starts are to be tried. INFEASIBLE is said of the problem, wherever the caller begins."""
-        return self.runs.best[1].status is Status.INFEASIBLE or (self._default and self._is_unacceptable)
+        return self.runs.best.status is Status.INFEASIBLE or (self._default and self._is_unacceptable)
 
     @property
     def needs_others(self) -> bool:
@@ -512,7 +512,7 @@ class Search:
         deeper than half the radius, or half the radius of the largest collision sphere. Without an ObstacleCost, a plan
         is unacceptable if it violates the constraints, or does nothing.
         """
-        problem, space, (run, best) = self._problem, self._problem.dynamics.state_coordinates, self.runs.best
+        problem, space, (run, best) = self._problem, self._problem.dynamics.state_coordinates, self.runs.finished[0]
         if not self._guided or problem.goal is None:
             # It does nothing where no single control helps from rest, but several together would.
             nominal = problem.nominal_controls
@@ -534,7 +534,7 @@ class Search:
     @property
     def is_without_plan(self) -> bool:
         """Whether no plan so far keeps the constraints, if there are any."""
-        return bool(self._problem.constraints) and not self.runs.best[1].success
+        return bool(self._problem.constraints) and not self.runs.best.success
 
 
 class Approaches:
@@ -559,7 +559,7 @@ class Approaches:
 
     def push_and_approach(self) -> None:
         """Begin with pushes by one control at a time, and with approaches to a body that nothing touches."""
-        problem, before, places = self._problem, self._runs.best[1], self.unmoved()
+        problem, before, places = self._problem, self._runs.best, self.unmoved()
         self.still = before, places
         plans = list[tuple[bool, float, str, Start]]()
 
@@ -592,7 +592,7 @@ class Approaches:
                 status = Status.TIME_LIMIT if self._stop.due else Status.STALLED
                 other = replace(begun, status=status, detail="no step lowers the cost of this plan")
             self._runs.offer(
-                run, other, better=before.violation >= other.violation and other.cost < self._runs.best[1].cost
+                run, other, better=before.violation >= other.violation and other.cost < self._runs.best.cost
             )
             if self.comes_nearer(other) and (self.best_nearer is None or other.cost < self.best_nearer[1].cost):
                 self.best_nearer = name, other
@@ -608,11 +608,11 @@ class Approaches:
     @property
     def left_alone(self) -> bool:
         """Whether another plan brings them nearer, and the best leaves them alone."""
-        return self.best_nearer is not None and not self.comes_nearer(self._runs.best[1])
+        return self.best_nearer is not None and not self.comes_nearer(self._runs.best)
 
     def unmoved(self) -> list[int]:
         """The states that miss their goal and that no control changes along the best plan."""
-        problem, best = self._problem, self._runs.best[1]
+        problem, best = self._problem, self._runs.best
         if not np.isfinite(best.cost):
             return []
         if best in self._unmoved:
@@ -699,7 +699,7 @@ class Softening:
         less: for the softest contacts, it would leave the body alone again.
         """
         problem, moved = self._problem, self._approaches.best_nearer
-        begin = self._runs.best[1] if moved is None else moved[1]
+        begin = self._runs.best if moved is None else moved[1]
         self.problems = [
             (name, replace(problem, dynamics=dynamics)) for name, dynamics in problem.dynamics.softened(begin.states)
         ]
@@ -708,7 +708,7 @@ class Softening:
         (name, widest), *harder = self.problems
         if moved is not None:
             self._stiffen({f", {moved[0]}": begin}, harder, [])
-            if self._runs.best[1].success or self._stop.due:
+            if self._runs.best.success or self._stop.due:
                 return
         results = {"": self._keep_softer(name, *_searched(widest, self._runs))}
         for cycles, side in itertools.product(SWAYS, (1, -1)):
@@ -741,7 +741,7 @@ class Softening:
 
     def leave_contact_modes(self) -> None:
         """If the best plan ended within its contact modes, and one beside it is cheaper, descend out of them."""
-        run, best = self._runs.best
+        run, best = self._runs.finished[0]
         contacts = None if best.certificate is None else best.certificate.contacts
         if contacts is None or not max(contacts.across, contacts.sampled) > run.final:
             return
@@ -751,7 +751,7 @@ class Softening:
 
     def _is_better(self, result: RunResult) -> bool:
         """Whether a plan is better than the best."""
-        best = self._runs.best[1]
+        best = self._runs.best
         # Where only one of them moves a body that was out of reach, cost decides: to leave it alone converges easily.
         if self._approaches.comes_nearer(result) == self._approaches.comes_nearer(best):
             return result.rank < best.rank
@@ -807,16 +807,16 @@ class Softening:
             return False
         self._runs.named.append(("the best plan, within its contact modes", run))
         detail = joined(plan.detail.partition("; ")[0], result.detail)
-        self._runs.offer(run, replace(result, detail=detail), better=result.rank <= self._runs.best[1].rank)
+        self._runs.offer(run, replace(result, detail=detail), better=result.rank <= self._runs.best.rank)
         return True
 
     @property
     def _cheapest(self) -> RunResult:
         """The cheapest plan, whether it has converged or not; with constraints, the best."""
         if self._problem.constraints:
-            return self._runs.best[1]
+            return self._runs.best
         finite = [result for _, result in self._runs.finished if np.isfinite(result.cost)]
-        return min(finite, key=lambda result: result.cost, default=self._runs.best[1])
+        return min(finite, key=lambda result: result.cost, default=self._runs.best)
 
 
 def _searched(problem: Problem, runs: Runs) -> tuple[SolveRun, RunResult]:
