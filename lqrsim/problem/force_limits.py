@@ -71,9 +71,9 @@ class ForceLimits(Constraint):
 
     def __init__(self, limits: Sequence[ForceLimit], later: Array | None = None) -> None:
         self.limits, self.later = tuple(limits), later
-        self._slopes = np.stack([limit.slopes for limit in self.limits]) if self.limits else np.zeros((0, 1))
+        self._slopes = np.stack([limit.slopes for limit in self.limits])
         # Less than what is spared, so that forces of such a plan are within their limits.
-        self._rough = 0.5 * SPARED * min((limit.high - limit.low for limit in self.limits), default=0.0)
+        self._rough = 0.5 * SPARED * min(limit.high - limit.low for limit in self.limits)
 
     def removed_from(self, dynamics: MjcfDynamics) -> MjcfDynamics:
         """Dynamics without these limits."""

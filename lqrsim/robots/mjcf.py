@@ -393,9 +393,9 @@ class MjcfRobot(Robot):
             constraints.append(constraint := self.self_clearance(self_clearance))
             constraint.check("start", dynamics, start)
             constraint.check("goal", dynamics, goal)
-        control_range = np.array([controls.low, controls.high])
-        forces = ForceLimits([limit for limit in self._forces[0] if limit.can_be_kept(start, *control_range)])
-        if force_limits and forces.limits:
+        kept = [limit for limit in self._forces[0] if limit.can_be_kept(start, *controls.limits)]
+        if force_limits and kept:
+            forces = ForceLimits(kept)
             unlimited = forces.removed_from(dynamics)
             if _is_stable(unlimited, start, at_start.controls, period):
                 dynamics = unlimited

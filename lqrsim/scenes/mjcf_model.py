@@ -24,7 +24,6 @@ from lqrsim.scenes.world import KINDS, World
 _OF_REVOLUTION = (mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_ELLIPSOID)
 _SIZES = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}
 _OF_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-TOTAL_MASS = "mass"  # name of the mass of all moving bodies together
 _NUMBERS = ("damping", "stiffness", "armature", "frictionloss")  # of joints
 _MEDIUM = ("density", "viscosity")
 _BOUNDS = {"mass": {"above": 0.0}, "gear": {}}  # bounds; all other numbers must not be negative
@@ -441,10 +440,10 @@ class MjcfModel:
             number = numbers[name]
             value = check_number(f"{what}: {name}", value, **_BOUNDS.get(number.what, {"at_least": 0.0}))
             ratio = value / number.value if number.value else 0.0
-            if name == TOTAL_MASS:
+            if name == "mass":  # of all moving bodies together
                 scales |= dict.fromkeys([model.body(number).name for number in self.carriers], ratio)
-                if other := next((key for key in values if key != TOTAL_MASS and numbers[key].what == "mass"), None):
-                    raise InputError(f"{what}: {TOTAL_MASS}: got {TOTAL_MASS} and {other}, want one of the two")
+                if other := next((key for key in values if key != "mass" and numbers[key].what == "mass"), None):
+                    raise InputError(f"{what}: mass: got mass and {other}, want one of the two")
             elif number.what == "mass":
                 scales[number.part] = ratio
             elif number.what in _NUMBERS:
