@@ -18,7 +18,6 @@ from runner import Result, Settings, at_most, between, counting, interval, openi
 
 import lqrsim as ls
 from lqrsim.disturbances import ControlNoise, Disturbance, Gusts, InitialStateError, Sensor, SensorErrors
-from lqrsim.stress import analysis
 
 SENSORS = (
     Sensor("quadrotor_gyro", noise=0.01, bias=0.01, bias_walk=1e-3, rate=200.0),
@@ -74,7 +73,7 @@ def main(config: Config) -> Result:
         results = ls.stress.run_campaign(campaign, folder, workers=0, progress=told)
         rows = []
         for cell in results.cells:
-            success, tally = analysis.success(cell, results.outcomes(cell)), results.tally(cell)
+            success, tally = results.outcomes(cell).success, results.tally(cell)
             failures = {how: tally[how] for how in FAILURES}
             rows.append({"cell": cell.sweep, "reached": interval(success.exact)} | failures)
     return opening(config) | {"rows": rows} | {"estimates": estimates(config)}

@@ -22,7 +22,6 @@ from runner import FolderSettings, Result, counting, interval, opening, run, tab
 import lqrsim as ls
 from lqrsim.disturbances import Disturbance
 from lqrsim.simulation.disturbances import PRESETS
-from lqrsim.stress import analysis
 
 # Of all disturbances together: those of the presets, and beyond, where they can be so strong.
 STRENGTHS = (0.125, 0.25, *PRESETS.values(), 6.0)
@@ -74,7 +73,7 @@ def together(config: Config, scenario: ls.Scenario, folder: Path) -> dict[str, A
     results = finished(config, asked, folder / "together")
     cells = []
     for cell in results.cells:
-        found = analysis.success(cell, results.outcomes(cell))
+        found = results.outcomes(cell).success
         cells.append({
             "policy": cell.policy, "strength": cell.strength, "reached": found.reached, "trials": found.trials,
             "band": interval(found.band),
@@ -131,10 +130,7 @@ def told(name: str, points: Sequence[tuple[float, list[float]]]) -> dict[str, An
 
 def success(found: dict[float, ls.stress.Outcomes]) -> list[tuple[float, list[float]]]:
     """Strength and exact interval of success, the weakest first."""
-    return [
-        (strength, interval(analysis.success(ls.stress.Cell("smooth", "alone", strength), outcomes).exact))
-        for strength, outcomes in sorted(found.items())
-    ]
+    return [(strength, interval(outcomes.success.exact)) for strength, outcomes in sorted(found.items())]
 
 
 def possible(one: Disturbance, strengths: Sequence[float]) -> list[float]:

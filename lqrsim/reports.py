@@ -4,7 +4,6 @@ import base64
 import json
 import os
 import tempfile
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files as packaged
@@ -25,7 +24,7 @@ from lqrsim.simulation.disturbances import Disturbance, uncertainty_of
 from lqrsim.stress import analysis
 from lqrsim.stress.results import Results, replay
 from lqrsim.stress.statistics import Estimate
-from lqrsim.stress.study import DESIGNED, Campaign, Cell, design_disturbances
+from lqrsim.stress.study import DESIGNED, Cell, design_disturbances
 from lqrsim.view import gl, style
 from lqrsim.view.style import RUNS
 
@@ -41,6 +40,7 @@ MOST_VIDEOS = 100  # a page with more videos is too large for a browser
 BROKEN_BELOW = 0.95  # success rate below which a policy counts as broken
 WORST_EACH = 3  # number of trials that are listed for each policy and sweep
 Curves = Mapping[str, Mapping[float, Array]]  # policy -> strength -> low, middle and high
+Breaks = Sequence[tuple[str, str, Cell | None]]  # of `analysis.breaks`
 
 
 def plot_curves(curves: Curves, path: Path, label: str, **scale: Any) -> Path:
@@ -80,18 +80,13 @@ def plot_errors(curves: Curves, path: Path, label: str) -> Path:
     return plot_curves(curves, path, label, yscale="log")
 
 
-def _videos_note(requested: int, shown: int) -> tuple[str, str]:
-    """A remark on the videos, and the reason why this machine cannot draw them; empty if it can."""
-    if not shown:
-        return "No videos were requested." if requested == 0 else "There is no trial to render.", ""
+def _without_opengl() -> str:
+    """The reason why this machine cannot draw pictures; empty if it can."""
     try:
         gl.bind()
     except InputError as error:
-        return f"There are none, for this machine cannot draw pictures: {error}", str(error)
-    return (
-        "The worst trial of each policy and sweep, alternating between policies, repeated from its number alone."
-        " Line: the plan; trace: the path, coloured by tracking error."
-    ), ""
+        return str(error)
+    return ""
 
 
 def _video(results: Results, trial: analysis.Trial, problem: str, folder: Path) -> dict[str, Any]:
@@ -135,26 +130,39 @@ def report(
       videos: number of the worst trials to repeat and render. Without OpenGL the page has no videos, and says so.
     """
     path = check_path("out", out, "the path of a page")
-    scenario, campaign, missing = results.trials.scenario, results.campaign, Counter[Cell]()
-    for cell, _, count in results.missing:
-        missing[cell] += count
-    begun = [cell for cell in results.cells if missing[cell] < campaign.trials]
-    table = {cell: results.outcomes(cell, partial=True) for cell in begun}
+    begun = sorted({shard.cell_number for shard in results.shards_on_disk()})
+    table = {cell: results.outcomes(cell, partial=True) for cell in map(results.cells.__getitem__, begun)}
     if not table:
         raise InputError(f"results: got {results.folder}, in which no trial has ended yet, want at least one")
     parts = 2 + videos
     tell = progress or (lambda done, total: None)
     tell(0, parts)
-    worst = worst_trials(table)
-    page = _text_and_tables(results, table, worst, scenario)
+    broken = analysis.breaks(table, below=BROKEN_BELOW)
+    # The worst trials of each policy and sweep, by breaking strength, alternating between policies.
+    turns = zip_longest(*([group for *group, _ in broken if group[0] == policy] for policy in policies(table)))
+    worst = [
+        analysis.worst({cell: table[cell] for cell in table if [cell.policy, cell.sweep] == group}, WORST_EACH)
+        for turn in turns
+        for group in turn
+        if group is not None
+    ]
+    page = _text_and_tables(results, table, broken, worst)
     tell(1, parts)
     with tempfile.TemporaryDirectory() as folder:
-        page["sweeps"] = [_sweep(name, table, scenario, campaign, Path(folder)) for name in campaign.sweeps]
+        page["sweeps"] = [_sweep(name, results, table, Path(folder)) for name in results.campaign.sweeps]
         tell(2, parts)
         worst_of_each = (next((trial for trial in trials if trial.outcome != "error"), None) for trials in worst)
         shown = [trial for trial in worst_of_each if trial is not None][:videos]
-        page["videos_note"], problem = _videos_note(videos, len(shown))
-        page["videos"] = []
+        problem, page["videos"] = _without_opengl() if shown else "", []
+        if problem:
+            page["videos_note"] = f"There are none, for this machine cannot draw pictures: {problem}"
+        elif shown:
+            page["videos_note"] = (
+                "The worst trial of each policy and sweep, alternating between policies, repeated from its number"
+                " alone. Line: the plan; trace: the path, coloured by tracking error."
+            )
+        else:
+            page["videos_note"] = "There is no trial to render." if videos else "No videos were requested."
         for number, trial in enumerate(shown):
             page["videos"].append(_video(results, trial, problem, Path(folder)))
             tell(3 + number, parts)
@@ -166,9 +174,10 @@ def report(
 
 
 def _text_and_tables(
-    results: Results, table: analysis.Table, worst: Sequence[list[analysis.Trial]], scenario: Scenario
+    results: Results, table: analysis.Table, broken: Breaks, worst: Sequence[list[analysis.Trial]]
 ) -> dict[str, Any]:
-    campaign, unit = results.campaign, tracking_unit(scenario.problem.dynamics.state_coordinates)
+    campaign, scenario = results.campaign, results.trials.scenario
+    unit = tracking_unit(scenario.problem.dynamics.state_coordinates)
     finished = {cell: outcomes for cell, outcomes in table.items() if len(outcomes) == campaign.trials}
     erred = sum(int((outcomes.outcome == "error").sum()) for outcomes in table.values())
     done, all_trials = sum(map(len, table.values())), len(results.cells) * campaign.trials
@@ -181,23 +190,24 @@ def _text_and_tables(
     return {
         "title": f"Stress test of {scenario.name}",
         "warnings": warnings,
-        "facts": _facts(results, table, scenario),
+        "facts": _facts(results, table),
         "commands": {"To resume or repair the campaign": results.command, "This page": results.command_of("report")},
         "asked": json.dumps(results.manifest["campaign"], indent=2, ensure_ascii=False),
-        "breaks": breaks_table(table),
+        "breaks": breaks_table(table, broken),
         "broken_below": f"{100 * BROKEN_BELOW:g} %",
         "reach": f"{radius:g} {target.unit} of the {target.name}",
         "compared": comparison_tables(finished, unit),
         "modes": failure_table(table),
-        "measures": measure_tables(table, scenario),
+        "measures": measure_tables(table, scenario, target),
         "worst": worst_table(worst, unit),
         "worst_each": WORST_EACH,
         "ranking": analysis.RANKING,
     }
 
 
-def _facts(results: Results, table: analysis.Table, scenario: Scenario) -> dict[str, list[str]]:
-    campaign, manifest, problem = results.campaign, results.manifest, scenario.problem
+def _facts(results: Results, table: analysis.Table) -> dict[str, list[str]]:
+    campaign, manifest, scenario = results.campaign, results.manifest, results.trials.scenario
+    problem = scenario.problem
     facts = {
         "Scenario": [
             f"{campaign.scenario}: {scenario.summary}",
@@ -231,15 +241,15 @@ def _describe(disturbances: Sequence[Disturbance], scenario: Scenario) -> str:
     return "; ".join(disturbance.describe(plant) for disturbance in disturbances) or "none"
 
 
-def _sweep(name: str, table: analysis.Table, scenario: Scenario, campaign: Campaign, folder: Path) -> dict[str, Any]:
+def _sweep(name: str, results: Results, table: analysis.Table, folder: Path) -> dict[str, Any]:
+    scenario = results.trials.scenario
     unit = tracking_unit(scenario.problem.dynamics.state_coordinates)
-    of_sweep = [cell for cell in table if cell.sweep == name]
-    curves = {policy: analysis.degradation(table, policy, name) for policy in policies(of_sweep)}
-    rates, errors = dict[str, dict[float, Array]](), dict[str, dict[float, Array]]()
-    for policy, points in curves.items():
-        bands = [(point.cell.strength, point.band) for point in points]
-        rates[policy] = {at: 100 * np.array([band.low, band.value, band.high]) for at, band in bands}
-        errors[policy] = {point.cell.strength: analysis.quantiles(table[point.cell], "rms") for point in points}
+    of_sweep = {cell: outcomes for cell, outcomes in table.items() if cell.sweep == name}
+    rates, errors = ({policy: dict[float, Array]() for policy in policies(of_sweep)} for _ in range(2))
+    for cell in sorted(of_sweep, key=lambda cell: cell.strength):
+        band = table[cell].success.band
+        rates[cell.policy][cell.strength] = 100 * np.array([band.low, band.value, band.high])
+        errors[cell.policy][cell.strength] = analysis.quantiles(table[cell], "rms")
 
     def in_words(curves: Curves, spec: str, unit: str = "") -> str:
         """The middles of curves, in words."""
@@ -249,7 +259,7 @@ def _sweep(name: str, table: analysis.Table, scenario: Scenario, campaign: Campa
     percent = {"ylim": (-3, 103), "yticks": np.linspace(0, 100, 6)}
     return {
         "name": name,
-        "words": _describe(campaign.sweeps[name], scenario),
+        "words": _describe(results.campaign.sweeps[name], scenario),
         "figures": [
             _picture(
                 plot_curves(rates, folder / "success.png", "trials that reached their goal (%)", **percent),
@@ -263,7 +273,7 @@ def _sweep(name: str, table: analysis.Table, scenario: Scenario, campaign: Campa
                 alt=f"Median tracking error ({unit}) over strength. {in_words(errors, '.2g')}.",
             ),
         ],
-        "success": success_table(name, curves),
+        "success": success_table(name, of_sweep),
     }
 
 
@@ -287,12 +297,12 @@ def policies(table: Iterable[Cell]) -> list[str]:
     return list(dict.fromkeys(cell.policy for cell in table))
 
 
-def breaks_table(table: analysis.Table) -> PageTable:
+def breaks_table(table: analysis.Table, broken: Breaks) -> PageTable:
     """The strength at which each policy breaks in each sweep."""
-    rows = [
-        [policy, sweep, *(("not at any", "") if there is None else (f"{there.cell.strength:g}", _percent(there.exact)))]
-        for policy, sweep, there in analysis.breaks(table, below=BROKEN_BELOW)
-    ]
+    rows = list[list[str]]()
+    for policy, sweep, cell in broken:
+        rate = ["not at any", ""] if cell is None else [f"{cell.strength:g}", _percent(table[cell].success.exact)]
+        rows.append([policy, sweep, *rate])
     return PageTable("Where policies break", ("policy", "sweep", "at strength", "success there"), rows)
 
 
@@ -344,7 +354,7 @@ def failure_table(table: analysis.Table) -> PageTable:
     return PageTable("Failures by how they ended, and the obstacles that were hit most", head, rows)
 
 
-def measure_tables(table: analysis.Table, scenario: Scenario) -> list[PageTable]:
+def measure_tables(table: analysis.Table, scenario: Scenario, target: Target) -> list[PageTable]:
     """Quantiles of all measures, a table for each sweep."""
     units = dict(analysis.MEASURES)
     of_controls = set(scenario.robot.dynamics.control_coordinates.units)
@@ -352,9 +362,8 @@ def measure_tables(table: analysis.Table, scenario: Scenario) -> list[PageTable]
         unit = of_controls.pop()
         units["effort"] = f"{unit}² s" if unit.isalpha() else f"({unit})² s"
     units["saturated"] = "share of periods"
-    space = scenario.problem.dynamics.state_coordinates
-    units |= dict.fromkeys(("worst", "rms", "final"), tracking_unit(space))
-    units["goal"] = Target(space, scenario.problem.weighed_goal, np.zeros((1, len(space)))).unit
+    units |= dict.fromkeys(("worst", "rms", "final"), tracking_unit(scenario.problem.dynamics.state_coordinates))
+    units["goal"] = target.unit
     head = ["policy", "strength", *(f"{name} ({unit})" if unit else name for name, unit in units.items())]
     tables = dict[str, list[list[str]]]()
     for cell, outcomes in table.items():
@@ -362,18 +371,6 @@ def measure_tables(table: analysis.Table, scenario: Scenario) -> list[PageTable]
         values = [_between(middle, low, high) for low, middle, high in quantiles]
         tables.setdefault(cell.sweep, []).append([cell.policy, f"{cell.strength:g}", *values])
     return [PageTable(sweep, head, rows) for sweep, rows in tables.items()]
-
-
-def worst_trials(table: analysis.Table) -> list[list[analysis.Trial]]:
-    """The worst trials of each policy and sweep, by breaking strength, alternating between policies."""
-    order = [(policy, sweep) for policy, sweep, _ in analysis.breaks(table, below=BROKEN_BELOW)]
-    turns = zip_longest(*([group for group in order if group[0] == policy] for policy in policies(table)))
-    return [
-        analysis.worst({cell: table[cell] for cell in table if (cell.policy, cell.sweep) == group}, WORST_EACH)
-        for turn in turns
-        for group in turn
-        if group is not None
-    ]
 
 
 def worst_table(worst: Sequence[list[analysis.Trial]], unit: str) -> PageTable:
@@ -393,16 +390,15 @@ def worst_table(worst: Sequence[list[analysis.Trial]], unit: str) -> PageTable:
     return PageTable("Worst trials", head, rows)
 
 
-def success_table(sweep: str, curves: Mapping[str, Sequence[analysis.Success]]) -> PageTable:
-    """The numbers of trials of each policy that reached the goal, a row for each strength."""
-    points = [point for of_policy in curves.values() for point in of_policy]
-    strengths = sorted({point.cell.strength for point in points})
-    of_cell = {(point.cell.policy, point.cell.strength): point for point in points}
+def success_table(sweep: str, table: analysis.Table) -> PageTable:
+    """The numbers of trials of each policy that reached the goal in a sweep, a row for each strength."""
 
-    def entry(point: analysis.Success | None) -> str:
-        if point is None:
+    def entry(cell: Cell) -> str:
+        if cell not in table:
             return "not run"
-        return f"{point.reached}/{point.trials}, {'deterministic: 1 run' if point.alike else _percent(point.exact)}"
+        rate = table[cell].success
+        return f"{rate.reached}/{rate.trials}, {'deterministic: 1 run' if rate.alike else _percent(rate.exact)}"
 
-    rows = [[f"{s:g}", *(entry(of_cell.get((policy, s))) for policy in curves)] for s in strengths]
-    return PageTable(f"{sweep}: trials that reached their goal", ("strength", *curves), rows)
+    names, strengths = policies(table), sorted({cell.strength for cell in table})
+    rows = [[f"{s:g}", *(entry(Cell(policy, sweep, s)) for policy in names)] for s in strengths]
+    return PageTable(f"{sweep}: trials that reached their goal", ("strength", *names), rows)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 import lqrsim as ls
 from lqrsim.stress import statistics
-from lqrsim.stress.analysis import Outcomes, breaks, comparisons, degradation, modes, quantiles, success, worst
+from lqrsim.stress.analysis import Outcomes, breaks, comparisons, modes, quantiles, worst
 from lqrsim.stress.study import Cell
 
 
@@ -47,28 +47,25 @@ def mixed(reached: int, trials: int) -> Outcomes:
     return table_of(["reached"] * reached + ["collided"] * (trials - reached))
 
 
-def test_degradation_is_in_the_order_of_strength_with_exact_intervals() -> None:
-    table = {
-        Cell("smooth", "wind", strength): mixed(reached, 300) for strength, reached in ((2, 0), (0, 300), (1, 285))
-    }
-    curve = degradation(table, "smooth", "wind")
-    assert [(point.cell.strength, point.reached) for point in curve] == [(0, 300), (1, 285), (2, 0)]
-    assert curve[2].exact.high == pytest.approx(1 - 0.025 ** (1 / 300), rel=1e-9)
+def test_rates_have_exact_intervals() -> None:
+    none, some = mixed(0, 300).success, mixed(285, 300).success
+    assert (none.reached, some.reached) == (0, 285)
+    assert none.exact.high == pytest.approx(1 - 0.025 ** (1 / 300), rel=1e-9)
     # Wilson's interval lies within that of Clopper and Pearson here.
-    assert curve[1].exact.low < curve[1].band.low < 0.95 < curve[1].band.high < curve[1].exact.high
+    assert some.exact.low < some.band.low < 0.95 < some.band.high < some.exact.high
 
 
 def test_trials_that_are_all_alike_are_no_sample() -> None:
     """Without a disturbance 200 trials are one, as is a single trial; an interval would be of nothing."""
     cells = Cell("smooth", "calm", 0.0), Cell("open_loop", "calm", 0.0)
     for trials in (1, 2, 200):
-        found = success(cells[0], table_of(["reached"] * trials, worst=0.1))
+        same = [table_of([end] * trials, worst=0.1, deterministic=True) for end in ("reached", "collided")]
+        found = same[0].success
         assert found.alike
         assert (found.exact.low, found.exact.high) == (1.0, 1.0)
-        same = table_of(["reached"] * trials, worst=0.1), table_of(["collided"] * trials, worst=0.1)
         assert comparisons(dict(zip(cells, same, strict=True))) == []
     for trials in (1, 3):
-        assert not success(cells[0], table_of(["error"] * trials, worst=0.1, ended=np.nan)).alike
+        assert not table_of(["error"] * trials, worst=0.1, ended=np.nan, deterministic=True).success.alike
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -78,7 +75,7 @@ def test_equal_outcomes_of_random_trials_are_a_sample(seed: int) -> None:
     trials, strength, won = int(rng.integers(1, 300)), rng.uniform(0.1, 3), bool(seed % 2)
     cells = Cell("smooth", "losses", strength), Cell("open_loop", "losses", strength)
     drawn = table_of(["reached" if won else "timed out"] * trials, worst=0.1)
-    found = success(cells[0], drawn)
+    found = drawn.success
     low, high = found.exact.low, found.exact.high
     edge = 0.025 ** (1 / trials)
     assert (low, high) == pytest.approx((edge, 1.0) if won else (0.0, 1 - edge), rel=1e-9)
@@ -87,9 +84,9 @@ def test_equal_outcomes_of_random_trials_are_a_sample(seed: int) -> None:
     if not won:  # broken only if that is sure
         assert (breaks({cells[0]: drawn}, below=0.5)[0][2] is None) == (1 - edge >= 0.5)
     fixed = replace(drawn, deterministic=True)
-    assert success(cells[0], fixed).alike
+    assert fixed.success.alike
     assert comparisons(dict.fromkeys(cells, fixed)) == []
-    assert not success(cells[0], table_of(["reached"] * trials, deterministic=True)).alike  # they differ
+    assert not table_of(["reached"] * trials, deterministic=True).success.alike  # they differ
     with pytest.raises(ls.InputError, match="deterministic: got 'yes'"):
         replace(drawn, deterministic="yes")
 
@@ -125,11 +122,11 @@ def test_what_breaks_first_is_sure_to_be_below_the_rate() -> None:
         for strength, reached in zip((0.0, 1.0, 2.0), of_strength, strict=True)
     }
     found = breaks(table)
-    strengths = [(policy, point and point.cell.strength) for policy, _, point in found]
+    strengths = [(policy, cell and cell.strength) for policy, _, cell in found]
     assert strengths == [("weaker", 1.0), ("weak", 2.0), ("strong", None)]
     assert found[0][2] is not None
-    assert found[0][2].exact.high < 0.95
-    assert [point and point.cell.strength for *_, point in breaks(table, below=1.0)] == [1.0, 1.0, 2.0]
+    assert table[found[0][2]].success.exact.high < 0.95
+    assert [cell and cell.strength for *_, cell in breaks(table, below=1.0)] == [1.0, 1.0, 2.0]
 
 
 def test_policies_are_compared_on_the_same_trials() -> None:
@@ -196,8 +193,6 @@ def test_worst_trials_are_ranked_as_it_says() -> None:
 
 def test_bad_input_is_named() -> None:
     table = {Cell("smooth", "wind", 1.0): mixed(1, 2)}
-    with pytest.raises(ls.InputError, match=r"policy: got 'smoth'.*did you mean smooth"):
-        degradation(table, "smoth", "wind")
     with pytest.raises(ls.InputError, match="measure: got 'speed'"):
         quantiles(table[Cell("smooth", "wind", 1.0)], "speed")
     with pytest.raises(ls.InputError, match="below: got 2"):
@@ -210,8 +205,6 @@ WRONG = [None, "x", 3, -1, 1.5, np.nan, [], {}, {"a": 1}, ["a"], [[1], [2, 3]], 
 @pytest.mark.parametrize(
     ("function", "arguments"),
     [
-        (success, {"cell": Cell("a", "s", 1.0), "outcomes": mixed(3, 5)}),
-        (degradation, {"table": {Cell("a", "s", 1.0): mixed(3, 5)}, "policy": "a", "sweep": "s"}),
         (breaks, {"table": {Cell("a", "s", 1.0): mixed(3, 5)}, "below": 0.9}),
         (comparisons, {"table": {Cell("a", "s", 1.0): mixed(3, 5)}}),
         (modes, {"outcomes": mixed(3, 5)}),

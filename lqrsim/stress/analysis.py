@@ -8,13 +8,14 @@ a failure.
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.annotations import SHARE, Bounds, Count, OneOf, checked
-from lqrsim.errors import Array, InputError, check_name, check_shape, excerpt, keep
+from lqrsim.errors import Array, InputError, check_shape, excerpt, keep
 from lqrsim.problem.belief import Belief
 from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import check_same_system, spaces_of
@@ -35,6 +36,17 @@ RANKING = (
     "The worst trials are those with errors, then those that collided or diverged, the earliest first, then those with"
     " the least clearance, then those with the largest tracking error."
 )
+
+
+@dataclass(frozen=True)
+class Success:
+    """The success rate of a cell."""
+
+    reached: int
+    trials: int
+    exact: Estimate  # the rate with Clopper and Pearson's interval, for claims
+    band: Estimate  # the rate with Wilson's interval, for plots
+    alike: bool  # whether all trials are the same run, because nothing was drawn; the rate is then exact
 
 
 @checked
@@ -85,6 +97,27 @@ class Outcomes:
 
     def __len__(self) -> int:
         return len(self.trial)
+
+    @cached_property
+    def success(self) -> Success:
+        """The success rate with its intervals."""
+        reached, trials = int(succeeded(self).sum()), len(self)
+        exact, band = statistics.rate(reached, trials), statistics.rate(reached, trials, method="wilson")
+        if alike := self._alike():
+            exact = band = Estimate(exact.value, exact.value, exact.value)
+        return Success(reached, trials, exact, band, alike)
+
+    def _alike(self) -> bool:
+        """Whether all trials are the same run, or there is one only: nothing was drawn, as at strength 0.
+
+        Equal outcomes do not show it: random trials may end alike. Trials that were not simulated do not count, nor do
+        trials that differ although nothing was drawn.
+        """
+        if not self.deterministic or np.isnan(self.ended).any():
+            return False
+        numbers = (self.ended, self.rms, self.worst, self.effort)
+        same = all(np.array_equal(values, np.full_like(values, values[0]), equal_nan=True) for values in numbers)
+        return same and len(set(self.outcome.tolist())) == 1
 
     @checked
     def first(self, count: Count) -> "Outcomes":
@@ -170,66 +203,21 @@ def _checked_table(table: Table) -> Table:
     return table
 
 
-@dataclass(frozen=True)
-class Success:
-    """The success rate of a cell."""
-
-    cell: Cell
-    reached: int
-    trials: int
-    exact: Estimate  # the rate with Clopper and Pearson's interval, for claims
-    band: Estimate  # the rate with Wilson's interval, for plots
-    alike: bool  # whether all trials are the same run, because nothing was drawn; the rate is then exact
-
-
-@checked
-def success(cell: Cell, outcomes: Outcomes) -> Success:
-    """The success rate of a cell with its intervals. Raises InputError if there are no trials."""
-    reached, trials = int(succeeded(outcomes).sum()), len(outcomes)
-    exact, band = statistics.rate(reached, trials), statistics.rate(reached, trials, method="wilson")
-    same = alike(cell, outcomes)
-    if same:
-        exact = band = Estimate(exact.value, exact.value, exact.value)
-    return Success(cell, reached, trials, exact, band, same)
-
-
-@checked
-def alike(cell: Cell, outcomes: Outcomes) -> bool:
-    """Whether all trials are the same run, or there is one only: nothing was drawn, as at strength 0.
-
-    Equal outcomes do not show it: random trials may end alike. Trials that were not simulated do not count, nor do
-    trials that differ although nothing was drawn.
-    """
-    if not len(outcomes) or np.isnan(outcomes.ended).any():
-        return False
-    if cell.strength and not outcomes.deterministic:
-        return False
-    numbers = (outcomes.ended, outcomes.rms, outcomes.worst, outcomes.effort)
-    same = all(np.array_equal(values, np.full_like(values, values[0]), equal_nan=True) for values in numbers)
-    return same and len(set(outcomes.outcome.tolist())) == 1
-
-
-def degradation(table: Table, policy: str, sweep: str) -> list[Success]:
-    """Success rates of a policy by increasing strength. Raises InputError if the table has no such policy or sweep."""
-    check_name("policy", policy, dict.fromkeys(cell.policy for cell in _checked_table(table)))
-    check_name("sweep", sweep, dict.fromkeys(cell.sweep for cell in table))
-    cells = [cell for cell in table if (cell.policy, cell.sweep) == (policy, sweep)]
-    return [success(cell, table[cell]) for cell in sorted(cells, key=lambda cell: cell.strength)]
-
-
 @checked
 def breaks(
     table: Table, *, below: Annotated[float, Bounds(above=0.0, at_most=1.0)] = 0.95
-) -> list[tuple[str, str, Success | None]]:
+) -> list[tuple[str, str, Cell | None]]:
     """Where each policy breaks in each sweep, the weakest first.
 
-    It is the smallest tried strength at which the interval of the success rate lies below the limit, if there is one.
+    It is the cell of the smallest tried strength at which the interval of the success rate lies below the limit, if
+    there is one.
     """
-    points = [
-        (policy, sweep, next((point for point in degradation(table, policy, sweep) if point.exact.high < below), None))
-        for policy, sweep in dict.fromkeys((cell.policy, cell.sweep) for cell in _checked_table(table))
-    ]
-    return sorted(points, key=lambda point: np.inf if point[2] is None else point[2].cell.strength)
+    points = dict[tuple[str, str], Cell | None].fromkeys((cell.policy, cell.sweep) for cell in _checked_table(table))
+    for cell in sorted(table, key=lambda cell: -cell.strength):
+        if table[cell].success.exact.high < below:
+            points[cell.policy, cell.sweep] = cell
+    order = sorted(points, key=lambda name: np.inf if (there := points[name]) is None else there.strength)
+    return [(*name, points[name]) for name in order]
 
 
 @dataclass(frozen=True)
@@ -258,7 +246,7 @@ def comparisons(table: Table) -> list[Comparison]:
     for other in policies[1:]:
         for first in (cell for cell in table if cell.policy == policies[0]):
             second = replace(first, policy=other)
-            if second in table and not (alike(first, table[first]) and alike(second, table[second])):
+            if second in table and not (table[first].success.alike and table[second].success.alike):
                 pairs.append((first, second))
     return compare_cells(pairs, table, table)
 
@@ -275,7 +263,7 @@ def compare_cells(
     compared = list[Comparison]()
     for first, second in pairs:
         outcomes, other_outcomes = firsts[first], seconds[second]
-        rates = success(first, outcomes), success(second, other_outcomes)
+        rates = outcomes.success, other_outcomes.success
         rms, both, only_first, only_second = None, 0, None, None
         if paired:
             if not np.array_equal(outcomes.trial, other_outcomes.trial):

@@ -136,7 +136,7 @@ class Results:
         found = Outcomes(**columns, deterministic=deterministic)
         reasons = Counter(reason for table in tables for reason in table["reason"].tolist() if reason)
         # What a summary says of them, so that it reads no table again.
-        self._known[cell] = _SoFar(shards, Counter(found.outcome.tolist()), reasons, analysis.success(cell, found))
+        self._known[cell] = _SoFar(shards, Counter(found.outcome.tolist()), reasons, found.success)
         return found
 
     def _so_far(self, cell: Cell) -> _SoFar:
