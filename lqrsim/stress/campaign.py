@@ -127,7 +127,8 @@ def run_campaign(
     campaign, folder = copy(campaign), check_path("folder", folder, "the path of a folder")
     workers = processors() if workers is None else workers
     tell = progress or (lambda done, total: None)
-    deterministic = _check_runnable(campaign)
+    _check_runnable(campaign)
+    specification = _specification(campaign)
     if os.path.isdir(folder) and not os.path.exists(folder / MANIFEST):
         names = (name for name in os.listdir(folder) if not name.startswith(".unfinished-"))
         if others := sorted({*names} - _CAMPAIGN_FILES):
@@ -136,20 +137,20 @@ def run_campaign(
         client = None if scheduler is None else stack.enter_context(connected(scheduler))
         stack.enter_context(_sole_writer(folder))
         stack.enter_context(_resumable(folder, campaign.scenario))
-        specification = _specification(campaign) | {"deterministic": deterministic}
         if os.path.exists(folder / MANIFEST):
             _check_same_campaign(specification, read_manifest(folder), folder)
         else:
             _begin(campaign, specification, folder)
         results = Results(folder, scenario=campaign.scenario)
+        # What is run is what is replayed, also where a function makes another scenario each time.
+        results.campaign = campaign
         unfinished = _unfinished(results)
         if unfinished and (others := changed(results.manifest["versions"])):
             want = f"the versions of {folder}, or another folder"
             raise InputError(f"versions: got {others}, which may change the last bits, want {want}")
-        trials = Trials(campaign, {policy: results.solution(policy) for policy in campaign.policies})
         if unfinished:
-            warm_up(trials)  # done here first, so that the workers find everything compiled
-        job = Job.of(trials, results.manifest, batch)
+            warm_up(results.trials)  # done here first, so that the workers find everything compiled
+        job = Job.of(results, batch)
         total = campaign.trials * len(results.cells)
         done = total - sum(shard.count for shard in unfinished)
         tell(done, total)
@@ -158,7 +159,7 @@ def run_campaign(
         elif workers:
             work = run_in_processes(job, unfinished, min(workers, len(unfinished)), campaign.time_limit)
         else:
-            work = ((shard, job.work(shard, trials)) for shard in unfinished)
+            work = ((shard, job.work(shard, results.trials)) for shard in unfinished)
         for shard, contents in stack.enter_context(contextlib.closing(work)):
             write(contents, results.path(shard))
             done += shard.count
@@ -166,8 +167,6 @@ def run_campaign(
         for cell, ends, _ in results.cell_successes():
             if (counted := ends.total()) != campaign.trials:
                 raise InputError(f"folder: got {counted} trials of {cell}, want {campaign.trials}: {results.command}")
-    # What was run is what is replayed, also where a function makes another scenario each time.
-    results.campaign, results.trials = campaign, trials
     return results
 
 
@@ -225,11 +224,8 @@ def _resumable(folder: Path, scenario: str) -> Iterator[None]:
         raise
 
 
-def _check_runnable(campaign: Campaign) -> list[list[Any]]:
-    """Raise InputError for errors that would occur in every trial, before anything is solved or written.
-
-    Returns the sweeps and strengths at which nothing is drawn.
-    """
+def _check_runnable(campaign: Campaign) -> None:
+    """Raise InputError for errors that would occur in every trial, before anything is solved or written."""
     scenario, given = campaign.resolved, campaign.given
     problem, plant = scenario.problem, scenario.plant()
     impossible = impossible_policies(scenario, given)
@@ -241,14 +237,6 @@ def _check_runnable(campaign: Campaign) -> list[list[Any]]:
     if problem.duration is None:
         plant.substeps(problem.dt)
     _ = campaign.goal_options  # raises InputError if they do not fit
-    deterministic = list[list[Any]]()
-    for sweep, strength in itertools.product(campaign.sweeps, campaign.strengths):
-        scaled = [disturbance.scaled(strength) for disturbance in campaign.sweeps[sweep]]
-        try:
-            drawn = [_may_draw(campaign, disturbance) for disturbance in scaled]
-        except InputError as error:
-            raise InputError(f"sweeps: {sweep} at strength {strength:g}: {error}") from None
-        deterministic += [] if any(drawn) else [[sweep, strength]]
     if {*DESIGNED} & {*campaign.policies}:
         design_uncertainty(scenario, campaign.design_disturbances)
     for cell in campaign.cells:
@@ -259,6 +247,18 @@ def _check_runnable(campaign: Campaign) -> list[list[Any]]:
                 raise InputError(f"policies: {cell.policy} for {cell.sweep}: {error}") from None
     if campaign.replan_every is not None and campaign.replan_every < 0.999 * problem.dt:
         raise InputError(f"replan_every: got {campaign.replan_every:g} s, want at least {problem.dt:g}")
+
+
+def _drawing_nothing(campaign: Campaign) -> list[list[Any]]:
+    """The sweeps and strengths at which nothing is drawn. Raises InputError if a disturbance does not fit the robot."""
+    deterministic = list[list[Any]]()
+    for sweep, strength in itertools.product(campaign.sweeps, campaign.strengths):
+        scaled = [disturbance.scaled(strength) for disturbance in campaign.sweeps[sweep]]
+        try:
+            drawn = [_may_draw(campaign, disturbance) for disturbance in scaled]
+        except InputError as error:
+            raise InputError(f"sweeps: {sweep} at strength {strength:g}: {error}") from None
+        deterministic += [] if any(drawn) else [[sweep, strength]]
     return deterministic
 
 
@@ -288,7 +288,10 @@ def _is_packaged(kind: type[Disturbance]) -> bool:
 
 
 def _specification(campaign: Campaign) -> dict[str, Any]:
-    """The fields of the manifest that need no solve; they stay the same when the campaign is resumed."""
+    """The fields of the manifest that need no solve; they stay the same when the campaign is resumed.
+
+    Raises InputError if a disturbance does not fit the robot.
+    """
     scenario, given = campaign.resolved, campaign.given
     return {
         "campaign": campaign.as_json(),
@@ -297,6 +300,7 @@ def _specification(campaign: Campaign) -> dict[str, Any]:
         "start": solving.digest_of_start(scenario),
         "solution": None if given is None else solving.digest_of_solution(given),
         "code": _code(campaign),
+        "deterministic": _drawing_nothing(campaign),
     }
 
 
@@ -320,6 +324,7 @@ def _begin(campaign: Campaign, specification: dict[str, Any], folder: Path) -> N
     write_manifest(folder, specification | {
         "policies": hashes, "versions": versions(), "machine": description(), "remarks": remarks,
         "left_out": f"left out: {missing}" if missing and by_default else "",
+        "cells": [[cell.policy, cell.sweep, cell.strength] for cell in campaign.cells],
     })  # fmt: skip
 
 
@@ -414,25 +419,25 @@ class Job:
     digest: str  # of the manifest
     solutions: Mapping[str, Solution]  # by policy
     batch: int
-    # An identifier that differs in every run, even of the same campaign.
-    run: str = field(default_factory=lambda: f"lqrsim-{uuid.uuid4().hex}")
+    # Differs in every run, even of the same campaign.
+    name: str = field(default_factory=lambda: f"lqrsim-{uuid.uuid4().hex}")
 
     @classmethod
-    def of(cls, trials: Trials, manifest: Mapping[str, Any], batch: int) -> "Job":
-        """The job of running these trials elsewhere. Its solutions lack the logs of their solves."""
+    def of(cls, results: Results, batch: int) -> "Job":
+        """The job of running a campaign's trials elsewhere. Its solutions lack the logs of their solves."""
         unused: dict[str, Any] = {"inverse_policy": None, "cost_to_come": None, "iterations": (), "candidates": ()}
-        solutions = {policy: replace(solution, **unused) for policy, solution in trials.solutions.items()}
-        return cls(manifest["campaign"], manifest["digest"], solutions, batch)
+        solutions = {policy: replace(solution, **unused) for policy, solution in results.trials.solutions.items()}
+        return cls(results.manifest["campaign"], results.manifest["digest"], solutions, batch)
 
     def prepare(self) -> Trials:
         """The trials of this job, kept in this process until there is another job."""
-        if self.run not in _prepared:
+        if self.name not in _prepared:
             _prepared.clear()
             campaign = Campaign.from_json(self.campaign, resolve(self.campaign["scenario"]))
             trials = Trials(campaign, self.solutions)
             warm_up(trials)
-            _prepared[self.run] = trials
-        return _prepared[self.run]
+            _prepared[self.name] = trials
+        return _prepared[self.name]
 
     def work(self, shard: Shard, trials: Trials | None = None) -> bytes:
         """Run a shard in this process, with these trials if given. Returns its file.
@@ -449,9 +454,9 @@ class Job:
             parts += [_rows(trials, cell, trial, 1) for trial in range(first, first + count)] if alone else [rows]
         return pack({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, shard, self.digest)
 
-    def failed(self, shard: Shard, reason: str) -> bytes:
+    def errors(self, shard: Shard, reason: str) -> bytes:
         """The file of a shard that could not be run: each of its trials is an error with this reason."""
-        return pack(_failed_rows(shard.first, shard.count, reason), shard, self.digest)
+        return pack(_error_rows(shard.first, shard.count, reason), shard, self.digest)
 
 
 _prepared: dict[str, Trials] = {}  # trials of the last job that this process worked for
@@ -473,12 +478,12 @@ def _rows(trials: Trials, cell: Cell, first: int, count: int) -> Columns:
         rollout = trials.run(cell, first, count, frames=False, contacts=False)
         table = outcomes(rollout, trials.scenario.problem).columns()
     except Exception as error:  # a disturbance or a scenario may raise anything; it counts as failed trials
-        return _failed_rows(first, count, format_error(error))
+        return _error_rows(first, count, format_error(error))
     reasons = np.array(rollout.reasons, dtype=np.str_)
     return table | {"reason": np.where(np.isin(table["outcome"], ("diverged", "error")), reasons, "")}
 
 
-def _failed_rows(first: int, count: int, reason: str) -> Columns:
+def _error_rows(first: int, count: int, reason: str) -> Columns:
     """The rows of trials that could not be run: errors with this reason."""
     columns: Columns = dict.fromkeys(COLUMNS, np.full(count, np.nan))
     columns |= {"trial": np.arange(first, first + count), "outcome": np.full(count, "error")}
@@ -496,27 +501,36 @@ def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: fl
     try:
         while waiting or busy:
             while waiting and len(busy) < max(workers, 1):
-                worker = _Worker(job, waiting.popleft(), time_limit)
+                worker = _Worker(waiting.popleft())
                 busy[worker.connection] = worker
             wait(busy, max(min(worker.deadline for worker in busy.values()) - time.monotonic(), 0.0))
             for worker in [*busy.values()]:
                 task = worker.task
                 try:
-                    file = worker.receive()
+                    message = worker.receive()
                 except (EOFError, OSError) as error:
-                    file = task.failed(worker, error)
+                    reason = task.given_up(worker, error)
                     del busy[worker.connection]
                     worker.end()
-                    if file is None:
+                    if reason:
+                        yield task.shard, job.errors(task.shard, reason)
+                    else:
                         waiting.appendleft(task)
-                else:
-                    if file is not None and waiting:
-                        worker.begin(waiting.popleft())
-                    elif file is not None:
-                        del busy[worker.connection]
-                        worker.end()
-                if file is not None:
-                    yield task.shard, file
+                    continue
+                match message:
+                    case "started":
+                        worker.send(job, _START_TIMEOUT)
+                    case "ready":
+                        worker.ready = True
+                        worker.send(task.shard, time_limit)
+                    case bytes(file):
+                        if waiting:
+                            worker.task = waiting.popleft()
+                            worker.send(worker.task.shard, time_limit)
+                        else:
+                            del busy[worker.connection]
+                            worker.end()
+                        yield task.shard, file
     finally:
         for worker in busy.values():
             worker.end()
@@ -530,10 +544,10 @@ class _Task:
     died: int = 0
     failed_starts: int = 0  # one after the other
 
-    def failed(self, worker: "_Worker", error: Exception) -> bytes | None:
-        """The file of a shard that has failed too often, or None. Raises InputError if no worker starts."""
+    def given_up(self, worker: "_Worker", error: Exception) -> str:
+        """The reason to run the shard no more, or nothing. Raises InputError if no worker starts."""
         if late := isinstance(error, TimeoutError):
-            reason = f"took longer than {worker.time_limit if worker.ready else _START_TIMEOUT:g} s, and was stopped"
+            reason = f"took longer than {worker.limit:g} s, and was stopped"
         else:
             worker.process.join(5.0)
             code = worker.process.exitcode
@@ -547,9 +561,7 @@ class _Task:
         self.failed_starts = 0 if worker.ready else self.failed_starts + 1
         if self.failed_starts == ATTEMPTS:
             raise InputError(f"workers: got processes that do not start ({reason}), want {_GUARD}") from None
-        if self.died == ATTEMPTS or (late and worker.ready):
-            return worker.job.failed(self.shard, reason)
-        return None
+        return reason if self.died == ATTEMPTS or (late and worker.ready) else ""
 
 
 def end_if_started_by_import() -> None:
@@ -570,36 +582,28 @@ class _Worker:
     and if the process dies before it reads them, the writer waits forever.
     """
 
-    def __init__(self, job: Job, task: _Task, time_limit: float) -> None:
-        self.job, self.task, self.time_limit = job, task, time_limit  # s
-        self.ready, self.deadline = False, time.monotonic() + _START_TIMEOUT
+    def __init__(self, task: _Task) -> None:
+        self.task, self.ready = task, False
+        self.limit, self.deadline = _START_TIMEOUT, time.monotonic() + _START_TIMEOUT  # s
         self.connection, theirs = _context.Pipe()
         self.process = _context.Process(target=_serve, args=(theirs,), name=_NAME, daemon=True)
         with _starting, _worker_environment(), _without_ctrl_c():
             self.process.start()
         theirs.close()  # then the end of the process closes the pipe
 
-    def receive(self) -> bytes | None:
-        """The file of its shard, or None before. Raises EOFError or OSError if the process has died; TimeoutError."""
-        if not self.connection.poll():
-            if time.monotonic() > self.deadline:
-                raise TimeoutError
-            return None
-        message = self.connection.recv()
-        if self.ready:
-            return message
-        if message == "started":
-            self.deadline = time.monotonic() + _START_TIMEOUT
-            self.connection.send(self.job)
-        else:
-            self.ready = True
-            self.begin(self.task)
+    def receive(self) -> bytes | str | None:
+        """What it says, or None if nothing yet. Raises EOFError or OSError if the process has died; TimeoutError."""
+        if self.connection.poll():
+            return self.connection.recv()
+        if time.monotonic() > self.deadline:
+            raise TimeoutError
         return None
 
-    def begin(self, task: _Task) -> None:
-        self.task, self.deadline = task, time.monotonic() + self.time_limit
+    def send(self, what: Job | Shard, limit: float) -> None:
+        """Send what it is to answer within so many seconds."""
+        self.limit, self.deadline = limit, time.monotonic() + limit
         with contextlib.suppress(OSError):  # if the process has died, the next to receive from it sees that
-            self.connection.send(task.shard)
+            self.connection.send(what)
 
     def end(self) -> None:
         """Stop the process, even in the middle of a task."""
@@ -693,14 +697,14 @@ def run_on_cluster(job: Job, shards: list[Shard], client: Any, time_limit: float
     submitted: dict[Any, Shard] = {}
     started: dict[Shard, tuple[str, float]] = {}  # the worker that began a shard, and the time
     client.subscribe_topic(
-        job.run, lambda event: started.update({Shard(*event[1][1]): (event[1][0], time.monotonic())})
+        job.name, lambda event: started.update({Shard(*event[1][1]): (event[1][0], time.monotonic())})
     )
     try:
         while True:
             # One running and one waiting for each worker.
             free_slots = 2 * max(1, sum(client.nthreads().values())) - len(submitted)
             for shard in itertools.islice(waiting, max(0, free_slots)):
-                submitted[client.submit(_task, job, shard, key=f"{job.run}-{shard.file}")] = shard
+                submitted[client.submit(_run_on_worker, job, shard, key=f"{job.name}-{shard.file}")] = shard
             if not submitted:
                 return
             with contextlib.suppress(TimeoutError), client.as_current():
@@ -710,22 +714,22 @@ def run_on_cluster(job: Job, shards: list[Shard], client: Any, time_limit: float
                     del submitted[future]
                     if future.status in ("cancelled", "lost"):
                         raise CancelledError
-                    failed = future.status != "finished"
-                    yield shard, job.failed(shard, format_error(future.exception())) if failed else future.result()
+                    done = future.status == "finished"
+                    yield shard, future.result() if done else job.errors(shard, format_error(future.exception()))
                 elif time.monotonic() - started.get(shard, ("", time.monotonic()))[1] > time_limit:
                     del submitted[future]
                     future.cancel()
                     # A thread that hangs cannot be stopped otherwise; the worker may have ended, or have no nanny.
                     with contextlib.suppress(Exception):
                         client.restart_workers([started[shard][0]], timeout=30, raise_for_error=False)
-                    yield shard, job.failed(shard, f"took longer than {time_limit:g} s, and was stopped")
+                    yield shard, job.errors(shard, f"took longer than {time_limit:g} s, and was stopped")
     except (CancelledError, asyncio.CancelledError):
         raise InputError(f"scheduler: got a scheduler that lost its tasks or was restarted, {RESUME}") from None
     except OSError as error:  # dask's connection errors are also OSErrors
         raise InputError(f"scheduler: got no answer ({error}), {RESUME}") from None
     finally:
         with contextlib.suppress(Exception):  # the scheduler may have ended
-            client.unsubscribe_topic(job.run)
+            client.unsubscribe_topic(job.name)
             client.cancel(list(submitted))
 
 
@@ -743,11 +747,11 @@ def _silenced() -> Iterator[None]:
             logger.disabled = False
 
 
-def _task(job: Job, shard: Shard) -> bytes:
+def _run_on_worker(job: Job, shard: Shard) -> bytes:
     """Run a shard in a worker, one at a time."""
     from distributed import get_worker
 
     with _one_at_a_time:
         worker = get_worker()
-        worker.log_event(job.run, [worker.address, [shard.cell_number, shard.first, shard.count]])
+        worker.log_event(job.name, [worker.address, [shard.cell_number, shard.first, shard.count]])
         return job.work(shard)

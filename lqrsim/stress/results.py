@@ -91,7 +91,7 @@ class Results:
         self.manifest = read_manifest(self.folder)
         self.cells = [Cell(*cell) for cell in self.manifest["cells"]]
         self._scenario = scenario
-        self._known = dict[Cell, _SoFar]()
+        self._known, self._solutions = dict[Cell, _SoFar](), dict[str, Solution]()
         reference = self.manifest["campaign"]["scenario"]
         if scenario is not None:
             named, known = (os.path.normpath(from_anywhere(text)) for text in (scenario, reference))
@@ -109,8 +109,7 @@ class Results:
     @cached_property
     def trials(self) -> Trials:
         """Runs the campaign's trials. Raises InputError as `campaign` does, or if a policy is damaged."""
-        solutions = {policy: self.solution(policy) for policy in self.campaign.policies}
-        return Trials(self.campaign, solutions)
+        return Trials(self.campaign, {policy: self.solution(policy) for policy in self.campaign.policies})
 
     @property
     def complete(self) -> bool:
@@ -268,12 +267,14 @@ class Results:
         }
 
     def solution(self, policy: str) -> Solution:
-        """The solution that a policy runs."""
-        path = self.folder / "policies" / f"{check_name('policy', policy, self.manifest['policies'])}.npz"
+        """The solution that a policy runs, read once."""
+        if check_name("policy", policy, self.manifest["policies"]) in self._solutions:
+            return self._solutions[policy]
+        path = self.folder / "policies" / f"{policy}.npz"
         hashes, solution = self.manifest["policies"][policy], save_load.load(path, Solution)
         if sha256(path.read_bytes()) != hashes["sha256"] or digest_of_solution(solution) != hashes["digest"]:
             raise InputError(f"policy: got {path}, which is damaged, want another folder for the campaign")
-        return solution
+        return self._solutions.setdefault(policy, solution)
 
     def shards(self, cell: Cell | None = None) -> Iterator[Shard]:
         """The shards of a cell; by default of all cells."""
@@ -484,8 +485,8 @@ class _Manifest:
 
 
 def write_manifest(folder: Path, contents: dict[str, Any]) -> None:
-    """Write the manifest: `contents`, with format, cells and hashes added. Raises InputError."""
-    manifest = {"format": FORMAT, "version": VERSION, **contents, "cells": _cells(contents["campaign"])}
+    """Write the manifest: `contents`, with format and hashes added. Raises InputError."""
+    manifest = {"format": FORMAT, "version": VERSION, **contents}
     manifest["digest"] = digest_of_rows(manifest)
     manifest["sha256"] = _seal(manifest)
     _check(parse(json.dumps(manifest)))  # without sorting: the sweeps define the order of the cells
@@ -511,14 +512,16 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def _check(manifest: dict[str, Any]) -> None:
-    """Raise InputError unless all fields are there, and the hashes fit."""
+    """Raise InputError unless all fields are there and valid, and the hashes fit."""
     _check_names("manifest", manifest, [field.name for field in fields(_Manifest)])
     _Manifest(**manifest)
     if manifest["sha256"] != _seal(manifest):
         raise InputError("sha256: got a hash that does not fit the content, want an unchanged file")
     campaign = manifest["campaign"]
     _check_names("campaign", campaign, CAMPAIGN_FIELDS)
-    if canonical(manifest["cells"]) != canonical(_cells(campaign)):
+    # Disturbances are left out: they may be a user's, and the user's file is not loaded here.
+    bare = Campaign(**{**campaign, "sweeps": dict.fromkeys(campaign["sweeps"], ()), "design_disturbances": None})
+    if canonical(manifest["cells"]) != canonical([[cell.policy, cell.sweep, cell.strength] for cell in bare.cells]):
         raise InputError("cells: got cells of another campaign, want each sweep, strength and policy")
     pairs = [[sweep, strength] for _, sweep, strength in manifest["cells"]]
     if not isinstance(fixed := manifest["deterministic"], list) or any(pair not in pairs for pair in fixed):
@@ -537,13 +540,6 @@ def _check_names(field: str, part: Mapping[str, Any], names: Sequence[str]) -> N
     if wrong := sorted(part.keys() ^ set(names)):
         got = f"{'' if wrong[0] in part else 'none of '}{excerpt(wrong[0])}"
         raise InputError(f"{field}: got {got}, want exactly {', '.join(names)}")
-
-
-def _cells(campaign: Mapping[str, Any]) -> list[list[Any]]:
-    """Policy, sweep and strength of each cell, in order. Raises InputError if a field of the campaign is invalid."""
-    # Disturbances are left out: they may be a user's, and the user's file is not loaded here.
-    bare = Campaign(**{**campaign, "sweeps": dict.fromkeys(campaign["sweeps"], ()), "design_disturbances": None})
-    return [[cell.policy, cell.sweep, cell.strength] for cell in bare.cells]
 
 
 def _seal(manifest: Mapping[str, Any]) -> str:
