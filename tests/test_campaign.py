@@ -301,6 +301,21 @@ def test_the_scenario_is_made_once(own: Path, tmp_path: Path) -> None:
     assert (tmp_path / "calls").read_text(encoding="utf-8") == "made\n"
 
 
+def test_workers_do_not_run_another_scenario_than_was_made(tmp_path: Path) -> None:
+    """They load its code, which may have changed since."""
+    path = tmp_path / "own.py"
+    path.write_text(OWN, encoding="utf-8")
+    options: dict[str, Any] = {"policies": ("smooth",), "strengths": (1.0,), "trials": 2}
+    campaign = Campaign.of_sets(f"{path}:troubled,kind=none", ["light"], **options)
+    changed = "dataclasses.replace(ls.scenarios.quadrotor(), goal_radius=0.1)"
+    path.write_text(OWN.replace("given = ls.scenarios.quadrotor()", f"given = {changed}"), encoding="utf-8")
+    says = r"scenario: got a worker for which .*own.py:troubled,kind=none is another than the campaign's, want code"
+    with pytest.raises(InputError, match=says):
+        run_campaign(campaign, tmp_path / "out", workers=1)
+    assert not multiprocessing.active_children()
+    assert not list((tmp_path / "out").glob("shards/*"))
+
+
 # What goes wrong in trials.
 
 

@@ -284,7 +284,7 @@ from lqrsim.stress import campaign
 from lqrsim.stress.study import Shard
 
 class Job(campaign.Job):
-    def prepare(self):
+    def prepare(self, **_):
         pass
     def work(self, shard):
         return b""
@@ -301,7 +301,7 @@ def interrupt(number):
 
 if __name__ == "__main__":
     for number in map(int, sys.argv[1:]):
-        run = campaign.run_in_processes(Job({}, "", {}, 1), [Shard(0, i, 1) for i in range(40)], 2, 100.0)
+        run = campaign.run_in_processes(Job({}, {}, 1), [Shard(0, i, 1) for i in range(40)], 2, 100.0)
         sys.setprofile(interrupt(number))
         try:
             list(run)

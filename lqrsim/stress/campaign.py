@@ -46,9 +46,9 @@ from lqrsim.results import save_load
 from lqrsim.results.archive import sha256
 from lqrsim.results.solution import Solution
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import resolve
+from lqrsim.scenarios.solutions import digest_of_solution, digest_of_start, remarks
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance
 from lqrsim.stress.analysis import COLUMNS, outcomes
@@ -123,7 +123,7 @@ def run_campaign(
         call it again.
     """
     end_if_started_by_import()
-    # A copy, so that the next run resolves the scenario again: its code may have changed.
+    # A copy, so that what is resolved here is resolved again in the next run: its code may have changed.
     campaign, folder = copy(campaign), check_path("folder", folder, "the path of a folder")
     workers = processors() if workers is None else workers
     tell = progress or (lambda done, total: None)
@@ -297,8 +297,8 @@ def _specification(campaign: Campaign) -> dict[str, Any]:
         "campaign": campaign.as_json(),
         "model": _digest_of_runs(scenario),
         "problem": scenario.problem.digest,
-        "start": solving.digest_of_start(scenario),
-        "solution": None if given is None else solving.digest_of_solution(given),
+        "start": digest_of_start(scenario),
+        "solution": None if given is None else digest_of_solution(given),
         "code": _code(campaign),
         "deterministic": _drawing_nothing(campaign),
     }
@@ -313,16 +313,16 @@ def _begin(campaign: Campaign, specification: dict[str, Any], folder: Path) -> N
     hashes = dict[str, dict[str, str]]()
     for policy, solution in solutions.items():
         path = save_load.save(solution, folder / "policies" / f"{policy}.npz")
-        hashes[policy] = {"digest": solving.digest_of_solution(solution), "sha256": sha256(path.read_bytes())}
+        hashes[policy] = {"digest": digest_of_solution(solution), "sha256": sha256(path.read_bytes())}
     if given is not None:
         save_load.save(given, folder / SOLUTION_FILE)
-    remarks = [f"{name} {line}" for name, plan in solutions.items() for line in solving.remarks(scenario, plan)]
+    lines = [f"{name} {line}" for name, plan in solutions.items() for line in remarks(scenario, plan)]
     impossible = impossible_policies(scenario, given)
     missing = "; ".join(f"{name}, {impossible[name]}" for name in DEFAULT_POLICIES if name in impossible)
     # Policies that were chosen leave out others on purpose.
     by_default = {*campaign.policies} == {*DEFAULT_POLICIES} - {*impossible}
     write_manifest(folder, specification | {
-        "policies": hashes, "versions": versions(), "machine": description(), "remarks": remarks,
+        "policies": hashes, "versions": versions(), "machine": description(), "remarks": lines,
         "left_out": f"left out: {missing}" if missing and by_default else "",
         "cells": [[cell.policy, cell.sweep, cell.strength] for cell in campaign.cells],
     })  # fmt: skip
@@ -415,8 +415,7 @@ def _is_intact(results: Results, shard: Shard) -> bool:
 class Job:
     """Everything that a worker needs for a campaign."""
 
-    campaign: Mapping[str, Any]  # as in its manifest
-    digest: str  # of the manifest
+    manifest: Mapping[str, Any]
     solutions: Mapping[str, Solution]  # by policy
     batch: int
     # Differs in every run, even of the same campaign.
@@ -427,14 +426,23 @@ class Job:
         """The job of running a campaign's trials elsewhere. Its solutions lack the logs of their solves."""
         unused: dict[str, Any] = {"inverse_policy": None, "cost_to_come": None, "iterations": (), "candidates": ()}
         solutions = {policy: replace(solution, **unused) for policy, solution in results.trials.solutions.items()}
-        return cls(results.manifest["campaign"], results.manifest["digest"], solutions, batch)
+        return cls(results.manifest, solutions, batch)
 
-    def prepare(self) -> Trials:
-        """The trials of this job, kept in this process until there is another job."""
+    def prepare(self, *, here: bool = False) -> Trials:
+        """The trials of this job, kept in this process until there is another job.
+
+        Raises InputError if this is the driver's machine, and the code of the scenario has changed meanwhile. Elsewhere
+        the files of its meshes may be in other folders, so that it is not compared.
+        """
         if self.name not in _prepared:
             _prepared.clear()
-            campaign = Campaign.from_json(self.campaign, resolve(self.campaign["scenario"]))
-            trials = Trials(campaign, self.solutions)
+            manifest, stated = self.manifest, self.manifest["campaign"]
+            scenario = resolve(stated["scenario"])
+            digests = manifest["model"], manifest["problem"]
+            if here and (_digest_of_runs(scenario), scenario.problem.digest) != digests:
+                got = f"a worker for which {stated['scenario']} is another than the campaign's"
+                raise InputError(f"scenario: got {got}, want code that has not changed since the campaign was made")
+            trials = Trials(Campaign.from_json(stated, scenario), self.solutions)
             warm_up(trials)
             _prepared[self.name] = trials
         return _prepared[self.name]
@@ -452,11 +460,12 @@ class Job:
             rows = _rows(trials, cell, first, count)
             alone = count > 1 and bool((rows["outcome"] == "error").any())
             parts += [_rows(trials, cell, trial, 1) for trial in range(first, first + count)] if alone else [rows]
-        return pack({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, shard, self.digest)
+        table = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return pack(table, shard, self.manifest["digest"])
 
     def errors(self, shard: Shard, reason: str) -> bytes:
         """The file of a shard that could not be run: each of its trials is an error with this reason."""
-        return pack(_error_rows(shard.first, shard.count, reason), shard, self.digest)
+        return pack(_error_rows(shard.first, shard.count, reason), shard, self.manifest["digest"])
 
 
 _prepared: dict[str, Trials] = {}  # trials of the last job that this process worked for
@@ -523,6 +532,8 @@ def run_in_processes(job: Job, shards: list[Shard], workers: int, time_limit: fl
                     case "ready":
                         worker.ready = True
                         worker.send(task.shard, time_limit)
+                    case InputError():
+                        raise message
                     case bytes(file):
                         if waiting:
                             worker.task = waiting.popleft()
@@ -577,9 +588,9 @@ def end_if_started_by_import() -> None:
 class _Worker:
     """A worker process, which runs one shard after the other.
 
-    It says that it has imported the caller's script, then receives the job, says that it can begin, and receives
-    shards. The job is not an argument of the process: Python writes arguments to a pipe whose other end it keeps open,
-    and if the process dies before it reads them, the writer waits forever.
+    It says that it has imported the caller's script, then receives the job, says that it can begin, or why it cannot,
+    and receives shards. The job is not an argument of the process: Python writes arguments to a pipe whose other end it
+    keeps open, and if the process dies before it reads them, the writer waits forever.
     """
 
     def __init__(self, task: _Task) -> None:
@@ -591,7 +602,7 @@ class _Worker:
             self.process.start()
         theirs.close()  # then the end of the process closes the pipe
 
-    def receive(self) -> bytes | str | None:
+    def receive(self) -> bytes | str | InputError | None:
         """What it says, or None if nothing yet. Raises EOFError or OSError if the process has died; TimeoutError."""
         if self.connection.poll():
             return self.connection.recv()
@@ -622,8 +633,12 @@ def _serve(connection: Connection) -> None:
         job: Job = connection.recv()
     except (EOFError, OSError):  # the driver has ended
         return
-    job.prepare()
     with contextlib.suppress(EOFError, OSError):
+        try:
+            job.prepare(here=True)
+        except InputError as error:
+            connection.send(error)
+            return
         connection.send("ready")
         while True:
             connection.send(job.work(connection.recv()))

@@ -30,9 +30,9 @@ from lqrsim.problem.belief import Belief
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.scenarios import solutions as solving
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import disturbance_set, from_anywhere, resolve
+from lqrsim.scenarios.solutions import check_solution, difference, remarks, solve
 from lqrsim.simulation.closed_loop import simulate
 from lqrsim.simulation.disturbances import Disturbance, uncertainty_of
 
@@ -99,7 +99,7 @@ def solve_policies(
     The policy in the solution for "track" is the tracking law, in that for "offset_free" the policy of "smooth".
 
     Args:
-      given: a solution from `solving.check_solution`, in place of the result of its solver.
+      given: a solution from `check_solution`, in place of the result of its solver.
       remark: whether to warn of plans that have not converged, or are of another problem.
     """
     check_used(given, policies)
@@ -108,12 +108,12 @@ def solve_policies(
     for policy in policies:
         solver = POLICY_KINDS[policy].solver
         if solver not in plans:
-            plans[solver] = solving.solve(scenario, solver)
+            plans[solver] = solve(scenario, solver)
         solutions[policy] = plans[solver].open_loop() if policy == "open_loop" else plans[solver]
     for solver, plan in plans.items():
         if not np.isfinite(plan.trajectory.states).all():
             raise InputError(f"policies: got a plan of {solver} that is {plan.status.name}, want a finite one")
-        for line in solving.remarks(scenario, plan) if remark else []:
+        for line in remarks(scenario, plan) if remark else []:
             _log.warning("the solution of %s %s", solver, line)
     if "track" in policies:
         problem = scenario.with_duration_of(solutions["track"]).problem
@@ -150,7 +150,7 @@ def impossible_policies(scenario: Scenario, given: Solution | None = None) -> di
     if given is not None and solver_of(given) == POLICY_KINDS["replan"].solver:
         stated = scenario.with_duration_of(given).problem
         if given.problem_digest != stated.digest:
-            other = f"another problem{solving.difference(given, stated)}"
+            other = f"another problem{difference(given, stated)}"
             impossible["replan"] = f"which re-plans the scenario's problem, while the solution is of {other}"
     return impossible
 
@@ -178,7 +178,7 @@ def make_controller(
             return OffsetFree(problem, solution, design_uncertainty(scenario, design), sensors=read)
         case "replan":
             if solution.problem_digest != problem.digest:
-                other = solving.difference(solution, problem)
+                other = difference(solution, problem)
                 got = f"replan for a solution of another problem than that of {scenario.name}{other}"
                 raise InputError(f"controller: got {got}; want one of its own, or {', '.join(CONTROLLERS[:-1])}")
             every = max(problem.dt, problem.steps * problem.dt / 10) if replan_every is None else replan_every
@@ -279,7 +279,7 @@ class Setup:
     @cached_property
     def given(self) -> Solution | None:
         """The solution that was given instead of solving, or None. Raises InputError if the solution does not fit."""
-        return None if self.solution is None else solving.check_solution(self.resolved, self.solution)
+        return None if self.solution is None else check_solution(self.resolved, self.solution)
 
     @cached_property
     def goal_options(self) -> dict[str, Any]:
