@@ -23,7 +23,7 @@ import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.codegen import disk_cache
 from lqrsim.commands import COMMANDS, console, solving, stressing
-from lqrsim.commands.options import options_of, stated
+from lqrsim.commands.options import arguments_for, options_of
 from lqrsim.commands.reproduce import SCRIPTS
 from lqrsim.commands.solving import Solve
 from lqrsim.view import gl
@@ -478,7 +478,7 @@ def test_options_that_are_read_from_source_are_those_that_python_has(command: An
     for name in names.split():
         assert options[name].default == given[name].default
         assert get_args(options[name].type)[0] == types[name]
-    passed = stated(SimpleNamespace(**dict.fromkeys(options, 0)), function, seed=1)
+    passed = arguments_for(function, SimpleNamespace(**dict.fromkeys(options, 0)), seed=1)
     assert {*names.split()} <= {*passed}
     assert passed["seed"] == 1
 
