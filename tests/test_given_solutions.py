@@ -18,7 +18,7 @@ from sampling import examples, is_short
 import lqrsim as ls
 import lqrsim.gym
 from lqrsim.cli import main
-from lqrsim.commands.options import stated
+from lqrsim.commands.options import arguments_for
 from lqrsim.commands.stressing import Break, Rare
 from lqrsim.scenarios.solutions import remarks
 from lqrsim.stress.study import solve_policies
@@ -152,7 +152,7 @@ def test_the_other_commands_run_it_too(
         raise ls.InputError("viewer: none here")
 
     for kind in (Rare, Break):
-        asked = stated(kind(scenario=DRIVE, solution=stored, policy="track"), ls.stress.ReliabilityProblem)
+        asked = arguments_for(ls.stress.ReliabilityProblem, kind(scenario=DRIVE, solution=stored, policy="track"))
         shown.append(ls.stress.ReliabilityProblem(**asked).score.solution.trajectory)
     monkeypatch.setattr(viewer, "open_viewer", opened)
     assert main(["view", DRIVE, "--solution", str(stored)]) == 2
