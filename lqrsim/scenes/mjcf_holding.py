@@ -414,8 +414,9 @@ def nonnegative_least_squares(matrix: Array, target: Array) -> Array:
     most = 30 * matrix.shape[1]
     with contextlib.suppress(RuntimeError):  # more iterations
         x, _ = nnls(matrix, target, maxiter=most)
-        slopes = (matrix @ x - target) @ matrix
-        size = np.linalg.norm(matrix, axis=0) * np.linalg.norm(target)
+        with np.errstate(over="ignore"):  # against a size beyond all floats, each slope is small
+            slopes = (matrix @ x - target) @ matrix
+            size = np.linalg.norm(matrix, axis=0) * np.linalg.norm(target)
         if (np.where(x > 0, np.abs(slopes), -slopes) <= _OFF * size).all():
             return x
     return lsq_linear(matrix, target, (0.0, np.inf), method="bvls", tol=1e-15, max_iter=most).x
