@@ -29,7 +29,7 @@ from lqrsim.control.controllers import Controller, ControllerRun, Feedback
 from lqrsim.errors import Array, InputError
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.disturbances import ControlNoise, ForceNoise
-from lqrsim.stress.campaign import Job, run_campaign
+from lqrsim.stress.campaign import Job, _code, run_campaign
 from lqrsim.stress.results import Columns, Damaged, Results, differences, replay, unpack
 from lqrsim.stress.study import Campaign, Cell, Shard, Trials
 
@@ -665,6 +665,19 @@ def test_code_of_ones_own_that_has_changed_is_refused(own: Path, tmp_path: Path)
     copy.write_text(OWN.replace("< self.share", "> self.share"), encoding="utf-8")
     with pytest.raises(InputError, match=r"^Trouble: got a file that has changed since .*out was begun, want it as it"):
         run_campaign(replace(troubled(copy, "none"), trials=2), folder, workers=0)
+
+
+def test_a_change_of_either_of_two_classes_of_one_name_is_noticed(own: Path, tmp_path: Path) -> None:
+    copies = [tmp_path / name for name in ("first.py", "second.py")]
+    for copy in copies:
+        shutil.copy(own, copy)
+    sweep = tuple(troubled(copy, "none").sweeps["own"][1] for copy in copies)
+    campaign = replace(CAMPAIGN, sweeps={"own": sweep})
+    found = [_code(campaign)]
+    for copy in copies:
+        copy.write_text(f"{OWN}\n# changed", encoding="utf-8")
+        found.append(_code(campaign))
+    assert len({repr(digests) for digests in found}) == 3
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from scipy.optimize import LinearConstraint, minimize
 
 import lqrsim as ls
 from lqrsim.errors import Array
+from lqrsim.problem.problem import PlainTerm
 from lqrsim.solvers.compiled import costs_of
 
 # Two links that a floor does not stop, with what is filled in as actuators.
@@ -94,6 +95,19 @@ def test_a_force_is_a_constraint_if_it_is_linear(
         for one in kept:
             force = data.qfrc_actuator[0] if one.of_joint else data.actuator_force[one.id]
             assert one.slopes @ [1.0, *state, *control] == pytest.approx(force, rel=1e-9, abs=1e-9)
+
+
+@settings(max_examples=examples(4))
+@given(nominal=st.floats(1e3, 1e8), most=st.floats(1.0, 50.0), negative=st.booleans())
+def test_a_nominal_limit_leaves_the_other_as_it_is(
+    tmp_path_factory: pytest.TempPathFactory, nominal: float, most: float, negative: bool
+) -> None:
+    low, high = (-most, nominal) if negative else (-nominal, most)
+    arm = robot(tmp_path_factory.mktemp("nominal"), f'<motor name="m" joint="a" forcerange="{low} {high}"/>')
+    term = arm.force_limits.bind(arm.dynamics)
+    idle = np.zeros(len(arm.dynamics.state_coordinates) + 1)
+    distance = PlainTerm(term, len(idle) - 1, 1).value(idle, 0 if negative else 1)
+    assert 0.99 * most < distance < most
 
 
 # Limits that leave little: along the outline, no plan keeps them.

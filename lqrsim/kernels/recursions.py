@@ -1,6 +1,6 @@
 """Recursions along a plan: moments of closed loops, a Kalman filter in square-root form, and tracking laws.
 
-`control/prediction.py`, `control/offset_free.py` and `control/tracking.py` have their forms. A step of the moments and
+`control/prediction.py`, `control/plan_model.py` and `control/tracking.py` have their forms. A step of the moments and
 of the laws lacks only products of large matrices, which BLAS does faster. One compiled function serves all sizes, so
 every array is flat. In the names below Y, X, Z, m, ... are sizes, and the arrays have the shapes of their records.
 """

@@ -1,14 +1,15 @@
 """Ratios of a rotation vector's angle that are smooth at zero, and their derivatives; see `rotations.py`.
 
 They are functions of s, the squared angle. Near zero they are series, such as sin x / x = sum (-s)^k / (2k + 1)!; the
-coefficients of the last ratio are |Bernoulli(2k + 2)| / (2k + 2)!. For s below 1/4 the first omitted term is less than
-1e-16 of the sum.
+coefficients of `cotangent_ratio` are |Bernoulli(2k + 2)| / (2k + 2)!. For s below 1/4 the first omitted term is less
+than 1e-16 of the sum, 3e-15 for first derivatives, and 2e-12 for second ones.
 """
 
 from math import cos, sin, sqrt
 
 
 def sine_ratio(s: float) -> float:
+    """sin x / x."""
     if s > 0.25:
         angle = sqrt(s)
         return sin(angle) / angle
@@ -16,6 +17,7 @@ def sine_ratio(s: float) -> float:
 
 
 def cosine_ratio(s: float) -> float:
+    """(1 - cos x) / x^2."""
     if s > 0.25:
         return (1 - cos(sqrt(s))) / s
     return 0.5 * (1 - s / 12 * (1 - s / 30 * (1 - s / 56 * (1 - s / 90 * (1 - s / 132 * (1 - s / 182))))))
@@ -29,6 +31,7 @@ def cubic_ratio(s: float) -> float:
 
 
 def cotangent_ratio(s: float) -> float:
+    """(1 - x/2 cot(x/2)) / x^2."""
     if s > 0.25:
         return (1 - sine_ratio(s) / (2 * cosine_ratio(s))) / s
     tail = 1 / 47900160 + s * (691 / 1307674368000 + s * (1 / 74724249600 + s * 3617 / 10670622842880000))

@@ -23,7 +23,7 @@ from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.mujoco_log import mujoco, unlogged
 
 # Fraction of its range that a plan keeps a force from its limits: MuJoCo's implicit integrators step differently where
-# a force is clipped, by however little.
+# a force is clipped, by however little. If one limit is nominal, such as -1e6 N, the range is twice the other.
 SPARED = 1e-3
 _PROBES, _LINEAR = 4, 1e-9  # random states at which a force is compared with its slopes, and the relative error
 
@@ -91,8 +91,8 @@ class ForceLimits(Constraint):
         by_state, by_control = np.split(self._slopes[:, 1:], [len(x)], axis=1)
         forces = [np.zeros((0, 1 + len(x) + len(u)))]
         for _ in range(1, count):
-            by_itself, pushed, offset = dynamics.linearize(state, u, dynamics.period)
-            state, a, b = by_itself @ state + pushed @ u + offset, by_itself @ a, by_itself @ b + pushed
+            A, B, c = dynamics.linearize(state, u, dynamics.period)
+            state, a, b = A @ state + B @ u + c, A @ a, A @ b + B
             at_zero = self._slopes[:, :1] + (by_state @ (state - a @ x - b @ u))[:, None]
             forces.append(np.hstack([at_zero, by_state @ a, by_state @ b + by_control]))
         return np.concatenate(forces)
@@ -125,9 +125,10 @@ class ForceLimits(Constraint):
             described += [f"the force {limit.name} of {word} {getattr(limit, side):g} {limit.unit}" for limit in limits]
         names = tuple(f"{limit.name} {side}" for side in ("low", "high") for limit in limits)
         low, high = (table.copy(), -table)
-        ranges = np.array([limit.high - limit.low for limit in limits])
-        low[..., 0] -= [limit.low for limit in limits] + SPARED * ranges
-        high[..., 0] += [limit.high for limit in limits] - SPARED * ranges
+        sides = np.array([(limit.low, limit.high) for limit in limits])
+        ranges = np.minimum(np.ptp(sides, axis=1), 2 * np.abs(np.where(sides == 0, np.inf, sides)).min(axis=1))
+        low[..., 0] -= sides[:, 0] + SPARED * ranges
+        high[..., 0] += sides[:, 1] - SPARED * ranges
         rows = np.concatenate([low, high], axis=1)
         return ConstraintTerm(
             source_of(__name__), np.concatenate([rows.shape[:2], rows.ravel()]), rows.shape[1], described.__getitem__,
@@ -195,7 +196,7 @@ def value(x, u, t, row, data):
 
 
 def slope(x, u, t, row, data, gradient):
-    """Add its gradient (W,)."""
+    """Add the gradient (W,) of the distance to a limit."""
     first = row_at(t, row, data)
     for i in range(W):
         gradient[i] += data[first + 1 + i]

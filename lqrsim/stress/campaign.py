@@ -192,7 +192,7 @@ def _sole_writer(folder: Path) -> Iterator[None]:
             raise InputError(f"folder: got {got}") from None
         with contextlib.suppress(OSError):  # shows which process has the lock
             os.ftruncate(handle, 0)
-            os.pwrite(handle, f"{os.getpid()}\n".encode(), 0) if hasattr(os, "pwrite") else None
+            os.write(handle, f"{os.getpid()}\n".encode())
         yield
     finally:
         os.close(handle)
@@ -344,8 +344,9 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
     ):  # fmt: skip
         if specification[name] != manifest[name]:
             older = other_lqrsim(manifest["versions"])
-            older = f", or with the hashes of {older}" if older else ""
-            raise InputError(f"scenario: got a {parts} other than the one {folder} was begun with{older}, want another")
+            got = f"a {parts} other than the one {folder} was begun with"
+            got += f", or with the hashes of {older}" if older else ""
+            raise InputError(f"scenario: got {got}, want the same, or another folder")
     if specification["solution"] != manifest["solution"]:
         got = "none" if specification["solution"] is None else "another"
         want = "none" if manifest["solution"] is None else folder / SOLUTION_FILE
@@ -377,12 +378,13 @@ def _digest_of_runs(scenario: Scenario) -> str:
 def _code(campaign: Campaign) -> dict[str, str | None]:
     """The hash of the file that defines each of the user's disturbances; None if no file defines it."""
     used = itertools.chain(*campaign.sweeps.values(), campaign.design_disturbances or ())
-    kinds, hashes = {type(disturbance) for disturbance in used}, dict[str, str | None]()
-    for kind in sorted(kinds, key=lambda kind: kind.__qualname__):
-        if not _is_packaged(kind):
-            file = getattr(sys.modules.get(kind.__module__), "__file__", None)
-            hashes[kind.__qualname__] = None if file is None else sha256(Path(file).read_bytes())
-    return hashes
+    kinds = {kind for kind in map(type, used) if not _is_packaged(kind)}
+    files = dict[str, list[str | None]]()  # by name, for two modules may have classes of one name
+    for kind in sorted(kinds, key=lambda kind: (kind.__qualname__, kind.__module__)):
+        file = getattr(sys.modules.get(kind.__module__), "__file__", None)
+        files.setdefault(kind.__qualname__, []).append(file)
+    contents = {name: [Path(path).read_bytes() for path in paths if path] for name, paths in files.items()}
+    return {name: sha256(*parts) if len(parts) == len(files[name]) else None for name, parts in contents.items()}
 
 
 def _unfinished(results: Results) -> list[Shard]:
@@ -450,7 +452,7 @@ class Job:
     def work(self, shard: Shard, trials: Trials | None = None) -> bytes:
         """Run a shard in this process, with these trials if given. Returns its file.
 
-        It is simulated in batches. If a batch fails, its trials are run again one by one.
+        It is simulated in batches. If a trial of a batch is an error, all its trials are run again one by one.
         """
         trials = trials or self.prepare()
         cell, last = trials.campaign.cells[shard.cell_number], shard.first + shard.count
@@ -477,8 +479,8 @@ def warm_up(trials: Trials) -> None:
     first = next(iter(trials.solutions.values()))
     law = make_controller("feedback", trials.scenario, first)
     outcomes(simulate(trials.plant, first, controller=law, **options), trials.scenario.problem)
-    filters = [cell for cell in trials.campaign.cells if POLICY_KINDS[cell.policy].controller == "offset_free"]
-    for cell in filters[:1]:  # its filter is also compiled
+    filtered = [cell for cell in trials.campaign.cells if POLICY_KINDS[cell.policy].controller == "offset_free"]
+    for cell in filtered[:1]:  # to compile its filter, too
         simulate(trials.plant, trials.solutions[cell.policy], controller=trials.controller(cell), **options)
 
 
@@ -717,7 +719,7 @@ def run_on_cluster(job: Job, shards: list[Shard], client: Any, time_limit: float
     try:
         while True:
             # One running and one waiting for each worker.
-            free_slots = 2 * max(1, sum(client.nthreads().values())) - len(submitted)
+            free_slots = 2 * max(1, len(client.nthreads())) - len(submitted)
             for shard in itertools.islice(waiting, max(0, free_slots)):
                 submitted[client.submit(_run_on_worker, job, shard, key=f"{job.name}-{shard.file}")] = shard
             if not submitted:
@@ -752,7 +754,7 @@ def run_on_cluster(job: Job, shards: list[Shard], client: Any, time_limit: float
 def _silenced() -> Iterator[None]:
     """In this block dask prints no tracebacks; errors that matter are raised."""
     known = [logger for logger in logging.Logger.manager.loggerDict.values() if isinstance(logger, logging.Logger)]
-    loggers = [logger for logger in known if logger.name.split(".")[0] == "distributed"]
+    loggers = [logger for logger in known if logger.name.split(".")[0] == "distributed" and not logger.disabled]
     for logger in loggers:
         logger.disabled = True
     try:

@@ -137,7 +137,8 @@ def collision_score(rollout: Rollout, *, first: Index = 0) -> Array:
 def miss_score(rollout: Rollout, *, first: Index = 0) -> Array:
     """The distance by which each trial misses its goal, or a larger `collision_score`, (K,); positive if it fails.
 
-    The unit is metres; for a goal without a position, it is the scaled error by which the trial is judged.
+    The unit is metres. For a goal without a position, the distance is the scaled error by which the trial is judged,
+    and the score is the larger of this number and a depth in metres.
     """
     outside = np.nan_to_num(rollout.goal_distance - rollout.goal_radius, nan=-np.inf)
     return np.maximum(collision_score(rollout, first=first), outside)
