@@ -166,7 +166,7 @@ def test_a_run_takes_its_time(rollout: ls.Rollout, monkeypatch: pytest.MonkeyPat
 
 def live(scenario: ls.Scenario, solution: ls.Solution, screen: Recorder, **options: object) -> list[str]:
     lines: list[str] = []
-    viewer.live(scenario.plant(), solution, screen, ended=lines.append, **options)  # pyright: ignore[reportArgumentType]
+    viewer.live(scenario.plant(), solution, screen, report=lines.append, **options)  # pyright: ignore[reportArgumentType]
     return lines
 
 

@@ -77,7 +77,7 @@ class Run:
         return self.planners[-1]
 
     def go(self, **options: Any) -> "Run":
-        made = {"planner": self.planner, "goal": self.goal, "ended": self.lines.append}
+        made = {"planner": self.planner, "goal": self.goal, "report": self.lines.append}
         viewer.live(self.plant, self.solution, self.screen, **(made | options))
         return self
 

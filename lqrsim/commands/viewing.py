@@ -207,7 +207,7 @@ class View:
             def go(screen: "Viewer") -> None:
                 console.say(viewer.KEYS if goal is None else f"{viewer.KEYS}\n{viewer.GOAL_KEYS}")
                 options = {"controller": controller, "disturbances": disturbances, "seed": self.seed}
-                viewer.live(plant, solution, screen, ended=console.say, planner=planner, goal=goal, **options)
+                viewer.live(plant, solution, screen, report=console.say, planner=planner, goal=goal, **options)
 
         with viewer.open_viewer(self.viewer, self.port, title=f"lqrsim {self.what}", **arguments, **options) as screen:
             console.say(screen.instructions)

@@ -55,14 +55,14 @@ def augment(x, u, t, data, multipliers, hessian, gradient):
     y, v = (shared, jacobian) if SHARED else (x, u)
     slope, total = stack(W), 0.0
     for row in range(int(multipliers[ROWS])):
-        force, held, value = force_of(y, v, t, row, data, multipliers)
+        force, capped, value = force_of(y, v, t, row, data, multipliers)
         total += value
         if EQUALITY or force > 0:
-            curvature = multipliers[PENALTY] if held == force else 0.0
+            curvature = multipliers[PENALTY] if capped == force else 0.0
             fill(slope, W, 0.0)
             constraint_slope(y, v, t, row, data, slope)
             for i in range(W):
-                gradient[i] -= held * slope[i]
+                gradient[i] -= capped * slope[i]
                 for j in range(W):
                     hessian[i, j] += curvature * slope[i] * slope[j]
     return total / (2 * multipliers[PENALTY])
@@ -85,17 +85,17 @@ def force_of(x, u, t, row, data, multipliers):
     """The force lambda - mu d of one value, that force limited by the price, and the Lagrangian's part times 2 mu."""
     multiplier = multipliers[MULTIPLIERS + int(multipliers[ROWS]) * t + row]
     force = multiplier - multipliers[PENALTY] * (constraint_value(x, u, t, row, data) - multipliers[MARGIN])
-    held, value = 0.0, -multiplier * multiplier
+    capped, value = 0.0, -multiplier * multiplier
     if EQUALITY or force > 0:
-        held = min(max(force, -multipliers[PRICE]), multipliers[PRICE])
-        value += held * (2 * force - held)
-    return force, held, value
+        capped = min(max(force, -multipliers[PRICE]), multipliers[PRICE])
+        value += capped * (2 * force - capped)
+    return force, capped, value
 
 
 def constraint_values(x, u, t, acts, data, multipliers, values):
     """Write a constraint's values at step t, ordered as the multipliers are.
 
-    If the constraint does not act, the values are satisfied: infinite for an inequality, zero for an equality.
+    Where the constraint does not act, they are those of one that is satisfied: infinite for an inequality, else zero.
     """
     shared, rows = stack(SHARED), int(multipliers[ROWS])
     if SHARED:

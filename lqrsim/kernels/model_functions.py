@@ -62,7 +62,7 @@ def step_second_order(x, u, model, weights, out, jacobian, hessian):
 
 def advance_all(steps, plan, model, arrived):
     """Write the state after each step of a plan, (T, N)."""
-    dynamics, none = model.dynamics, arrived
+    dynamics, none = model.dynamics, arrived  # any array stands for what STATES does not need
     if dynamics.all_steps != 0:
         p = dynamics.parameters
         call(dynamics.all_steps, STATES, steps, plan.states, plan.controls, p, model.dt, none, arrived, none, none)
@@ -94,7 +94,7 @@ def cost_value(x, u, t, cost):
 
 
 def cost_added(x, u, t, cost):
-    """The terms of the augmented Lagrangian for constraints."""
+    """The value of the augmented Lagrangian's terms for constraints."""
     total, constraints = 0.0, cost.constraints
     for k in range(constraints.size):
         total += call_for_value(
@@ -111,8 +111,8 @@ def cost_quadratic(x, u, t, cost, hessian, gradient):
 def cost_of_order(x, u, t, cost, second_order, hessian, gradient):
     """Write the quadratic model of a cost and its augmented Lagrangian at (x, u); return the value.
 
-    The Hessian (W, W) is a mixture: a fraction `second_order` of the true one, and the rest of that with the sum of the
-    terms that may be indefinite projected to the nearest positive-semidefinite matrix.
+    The Hessian (W, W) is second_order H + (1 - second_order) H+. In H+ the sum of the terms that may be indefinite is
+    projected to the nearest positive-semidefinite matrix.
     """
     own = cost_alone(x, u, t, cost, second_order, hessian, gradient)
     return own + augment_cost(x, u, t, cost, hessian, gradient)

@@ -6,17 +6,17 @@ In planning, a quadratic cost-to-go v with Hessian S at t + 1 has the expectatio
 
     E v(g + M w) = v(g) + 1/2 tr M'SM
 
-so noise is an additional cost of the stage, which depends on S alone. The backward pass has just computed S; the
-forward pass uses S from the last backward pass. If dynamics and M are linear and costs quadratic, this is exact. With
-constraints another S may be given, without their penalties; see `SolveRun.weigh_noise`.
+so noise is an additional cost of the stage, which of the cost-to-go needs S alone. The backward pass has just computed
+S; the forward pass uses S from the last backward pass. If dynamics and M are linear and costs quadratic, this is exact.
+With constraints another S may be given, without their penalties; see `SolveRun.weigh_noise`.
 
 With a risk theta, the expectation is replaced by (1/theta) log E exp(theta v(g + M w)). With d = S g + s, the gradient
 of v at g, this is
 
     v(g) + theta/2 d'M C M'd - 1/(2 theta) log det(I - theta M'SM),    C = (I - theta M'SM)^-1
 
-which exists if I - theta M'SM is positive definite. As theta goes to 0 it becomes the expectation. For theta above 0 it
-is v at g + y minus the cost of y, where y = theta M C M'd is the worst noise.
+which exists if I - theta M'SM is positive definite. As theta goes to 0 it becomes the expectation. For theta above 0
+the first two terms are v at g + y minus the cost of y, where y = theta M C M'd is the worst noise.
 
 Gradients are exact. Hessians are Gauss-Newton approximations: second derivatives of M, and other parts that can be
 negative, are left out.
@@ -68,7 +68,7 @@ class NoiseTerm(Term):
     `kernels/declarations.py`. The data are the parameters or the matrix, then the strength.
 
     Attributes:
-      rows: the states that noise acts on at once. size: number of entries of w.
+      rows: the states that noise acts on directly. size: number of entries of w.
       active: the entries of (x, u), states before controls, that M depends on.
     """
 

@@ -180,7 +180,7 @@ class Target:
         return self.on_the_way(TOLERANCE)
 
     def radius_of_plan(self, radius: float | None) -> float | None:
-        """A known radius; else the default one, which in metres only a robot has."""
+        """The radius if it is given; else that of the scaled error. None in metres: the robot's is the default."""
         return self.on_the_way(TOLERANCE) if radius is None and not self.places else radius
 
     def on_the_way(self, radius: float) -> float:

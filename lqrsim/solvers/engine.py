@@ -112,8 +112,8 @@ class RunResult:
     certificate: Certificate | None = None
     final: bool = False  # whether no other start can do better
     stuck: bool = False  # whether the violation no longer falls, however large the penalty
-    # Of a plan whose violation is stationary: this in a measure that is the same for a whole search, and in words, what
-    # conflicts with the violated constraints, the strongest first.
+    # Of a plan whose violation is stationary: the violation in a measure that is the same for a whole search; and what
+    # conflicts with the violated constraints, in words, the strongest first.
     missed: float = np.nan
     against: tuple[str, ...] = ()
     remedy: str = ""  # one that is known already; empty for the usual one
@@ -147,8 +147,8 @@ class RunResult:
         """Whether this plan costs more than another, by more than rounding.
 
         What active constraints cost by ending inside, and the other plan saves by missing them within the tolerance, is
-        rounding, too: a given optimum may be on its bounds. Where both plans cost nothing but rounding, as a goal that
-        is met, only the size of what cancels says what that is.
+        rounding, too: a given optimum may be on its bounds. Where both costs are rounding, as where a goal is met
+        exactly, the tolerance follows from the size of the terms that cancel.
         """
         rounding = ROUNDING * abs(other.cost) + MARGIN_SQUARES * float(work.memory["negligible"])
         for multipliers, pressing in zip(work.multipliers, self.multipliers, strict=False):
@@ -191,7 +191,7 @@ class SolveRun:
         self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, budget: Budget,
         entry: str = "smoother",
     ) -> None:  # fmt: skip
-        """If possible in memory that an earlier run gave back, whose result this overwrites."""
+        """Use the memory that an earlier run gave back, if there is any, and overwrite that run's result."""
         if settings.first_pass == "backward" and (initial_guess.gain.any() or problem.dynamics.discrete):
             initial_guess = initial_guess.rolled_out(problem, start)
         self.problem, self.settings, self.initial_guess, self.budget = problem, settings, initial_guess, budget

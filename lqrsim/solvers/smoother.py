@@ -352,22 +352,22 @@ def solve(problem: Problem, settings: SmootherSettings, stop: Stop | None = None
     return solution._examined_by(partial(between_knots, seen, solution.trajectory))
 
 
-class _Pass(NamedTuple):
+class _Round(NamedTuple):
     """A problem that `solve_fixed` solves, and what may follow."""
 
     problem: Problem
     settings: SmootherSettings
-    refinements: int = REFINEMENTS  # of constraints along a plan, which are left
+    refinements: int = REFINEMENTS  # number of refinements of constraints that may follow
     preliminary: bool = False  # whether its plan is to be refined once more, with the caller's settings
     outlined: bool = False  # whether its constraints are refined along an outline
 
 
 def solve_fixed(problem: Problem, settings: SmootherSettings, stop: Stop, *, trees: bool = True) -> Solution:
-    """Solve a problem of fixed duration, and again with constraints that the plan misses within its periods refined."""
-    now, log = _Pass(problem, settings), tuple[Iteration, ...]()
+    """Solve a problem of fixed duration; refine constraints that the plan misses within periods, and solve again."""
+    now, log = _Round(problem, settings), tuple[Iteration, ...]()
     if any(constraint._rough for constraint in problem.constraints):
         outlined, rough, log = _outlined(problem, settings, stop)
-        now = _Pass(outlined, rough, preliminary=rough is not settings, outlined=outlined is not problem)
+        now = _Round(outlined, rough, preliminary=rough is not settings, outlined=outlined is not problem)
     while True:
         solution = Search(now.problem, now.settings, stop).solve(trees=trees)
         if log:
@@ -378,7 +378,9 @@ def solve_fixed(problem: Problem, settings: SmootherSettings, stop: Stop, *, tre
         now, log = following, solution.iterations
 
 
-def _following(now: _Pass, solution: Solution, stated: Problem, original: SmootherSettings, stop: Stop) -> _Pass | None:
+def _following(
+    now: _Round, solution: Solution, stated: Problem, original: SmootherSettings, stop: Stop
+) -> _Round | None:
     """What to solve after a solution of the stated problem with the original settings; None if it is the answer."""
     failed = solution.status in (Status.INFEASIBLE, Status.STALLED) and solution.trajectory.finite
     if failed and now.outlined:  # no plan may keep the constraints as they are along the outline
@@ -388,11 +390,11 @@ def _following(now: _Pass, solution: Solution, stated: Problem, original: Smooth
         return None
     again = replace(original, start=solution, starts=None)
     if now.refinements and (refined := now.problem._refined(solution.trajectory)) is not None:
-        return _Pass(refined, again, now.refinements - 1)
+        return _Round(refined, again, now.refinements - 1)
     allowed = original.violation_tolerance(now.problem)
     settled = solution.status is Status.COST_CONVERGED and solution.violation <= allowed
     if now.preliminary and not settled:
-        return _Pass(now.problem, again, now.refinements - 1)
+        return _Round(now.problem, again, now.refinements - 1)
     return None
 
 

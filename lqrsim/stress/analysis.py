@@ -56,7 +56,7 @@ class Outcomes:
 
     Attributes:
       obstacle: the obstacle that the trial collided with; empty if it ended otherwise.
-      ended: time in seconds of its collision, divergence or error; the horizon without one.
+      ended: time in seconds at which the trial collided, diverged or raised an error; else the horizon.
       worst: largest tracking error, in `Rollout.tracking_unit`: metres for robots with a position.
       rms: root mean square of the tracking error, in the same unit.
       final: tracking error at the end of the plan; NaN if the trial ended before.
@@ -108,7 +108,7 @@ class Outcomes:
         return Success(reached, trials, exact, band, alike)
 
     def _alike(self) -> bool:
-        """Whether all trials are the same run, or there is one only: nothing was drawn, as at strength 0.
+        """Whether nothing was drawn, as at strength 0, so that all trials are the same run.
 
         Equal outcomes do not show it: random trials may end alike. Trials that were not simulated do not count, nor do
         trials that differ although nothing was drawn.

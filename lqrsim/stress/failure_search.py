@@ -42,7 +42,7 @@ Size = int | Sequence[int] | None
 LEAST_DEPTH = 1e-9  # m; the score of a collision between two knots
 ZEROS = np.broadcast_to(0.0, 10**12)  # more than any trial draws, in the memory of one number
 PROBES = 32  # trials that show how much the disturbances change the clearance while the robot leaves an obstacle
-STEADY = 20.0  # a clearance of more of its standard deviations does not show which trials are near a collision
+STEADY = 20.0  # standard deviations; a larger mean clearance does not show which trials are near a collision
 
 
 class PrescribedDraws:
@@ -432,7 +432,7 @@ class RareFailures:
         settings, score = {**self.options, "shown": shown}, self.problem.score
         write_json(self.problem, score.solution, folder / "rare.json", settings, findings, self.stopped)
         save_load.save(self.certificate(), folder / "certificate.npz")
-        return _saved(score, numbers, folder)
+        return _save_rollout(score, numbers, folder)
 
 
 @dataclass(frozen=True, eq=False)
@@ -449,8 +449,7 @@ class Recheck:
         done, certified = len(self.measured.splitting.repetitions), len(self.certificate.repetitions)
         lines = [f"measured again: {done} of {certified} repetitions, {self.measured.splitting.simulations:,} trials"]
         if self.changed:
-            why = f"for the bits may differ: got {self.changed}"
-            lines.append(f"{self.measured.probability:.2g}; intervals are compared, {why}")
+            lines.append(f"{self.measured.probability:.2g}; only intervals are compared, because of {self.changed}")
         lines += [f"NOT as certified: {difference}" for difference in self.differences]
         if not self.differences:
             lines.append("as certified: the intervals overlap" if self.changed else "as certified, to the last bit")
@@ -604,11 +603,11 @@ class SmallestFailure:
         }  # fmt: skip
         score = self.problem.score
         write_json(self.problem, score.solution, folder / "break.json", self.options, findings, self.stopped)
-        return _saved(score, point.numbers[None], folder)
+        return _save_rollout(score, point.numbers[None], folder)
 
 
-def _saved(score: TrialScore, numbers: Array, folder: Path) -> Rollout:
-    """The trials with these numbers, which are written as rollout.npz."""
+def _save_rollout(score: TrialScore, numbers: Array, folder: Path) -> Rollout:
+    """Run the trials with these numbers, write them as rollout.npz, and return them."""
     # With contacts, for pictures; bit-identical until the collision.
     rollout = replace(score, contacts=True).rollout(numbers)
     save_load.save(rollout, folder / "rollout.npz")

@@ -254,7 +254,7 @@ class Viewer(abc.ABC):
 
 KEYS = """Arrow keys and Page Up/Down push the robot, seen from the camera. Ctrl and the right mouse button drag it.
 Space pauses, Backspace starts again."""
-GOAL_KEYS = "Enter, or a double click on the orange goal: the same keys and mouse move the goal; and back to the robot."
+GOAL_KEYS = "Enter, or a double click on the orange goal: the same keys and mouse move the goal. Again: the robot."
 PAUSE_SECONDS = 1.0  # s, between two runs
 GLFW_KEYS = {"RightArrow": 262, "LeftArrow": 263, "DownArrow": 264, "UpArrow": 265, "PageUp": 266, "PageDown": 267}
 
@@ -366,15 +366,15 @@ class MovableGoal:
         of_position = [(term, reference) for term, reference in references if reference.weight[self._position].any()]
         if len(of_position) != 1:
             raise InputError(f"goal: got {len(of_position)} QuadraticCosts of the position in final_cost, want one")
-        ((self._drawing, self._reference),) = of_position
+        ((self._goal_term, self._reference),) = of_position
         self.place = self._reference.about[self._position]  # (2 or 3,)
 
     def cost_at(self, place: Array) -> Cost:
         """The final cost with its goal at another place (2 or 3,)."""
         about = self._reference.about.copy()
         about[self._position] = place
-        moved = self._drawing.moved_to(about, self._dynamics)
-        terms = tuple(moved if term is self._drawing else term for term in terms_of(self._cost))
+        moved = self._goal_term.moved_to(about, self._dynamics)
+        terms = tuple(moved if term is self._goal_term else term for term in terms_of(self._cost))
         return terms[0] if len(terms) == 1 else CostSum(terms)
 
 
@@ -522,7 +522,7 @@ def live(
     planner: Callable[[], LiveReplanner] | None = None,
     goal: MovableGoal | None = None,
     seed: int = 0,
-    ended: Callable[[str], object] = lambda line: None,
+    report: Callable[[str], object] = lambda line: None,
 ) -> None:
     """Simulate in step with the viewer, under the forces of the person, until the viewer is closed.
 
@@ -538,7 +538,7 @@ def live(
     def watch(time: float, qpos: Array, unstable: np.ndarray) -> None:
         apart = np.linalg.norm(viewer.of_world(viewer.show(time, qpos[0]) - viewer.planned_position()))
         if unstable.any() or not apart < plant.model.stat.extent:
-            ended(f"run {run}: lost after {time:.1f} s")
+            report(f"run {run}: lost after {time:.1f} s")
             raise RestartRequested
 
     def once() -> str:
@@ -552,13 +552,13 @@ def live(
             try:
                 rollout = simulate(plant, lengthened(solution), controller=law, **options)
             finally:
-                ended(replanner.summary())
+                report(replanner.summary())
         return f"run {run}: {rollout.reasons[0] or f'has lasted {LONGEST_RUN:g} s'}"
 
     run, everything = 0, [*disturbances, _UserForces(viewer)]
     with contextlib.suppress(ViewerClosed):
         while True:
             with contextlib.suppress(RestartRequested):
-                ended(once())
+                report(once())
                 viewer.wait(PAUSE_SECONDS)
             run += 1
