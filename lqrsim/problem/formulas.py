@@ -271,7 +271,7 @@ class FunctionCost(OfFunction, Cost):
         about six digits, at two evaluations for every pair of entries in `depends_on`; JAX derives them.
       depends_on: names of the states and controls that the cost depends on; all by default. The fewer, the faster.
       parameters: name -> value, as in `Dynamics`.
-      convex, name: as in `SymbolicCost`.
+      convex: this and `name` are as in `SymbolicCost`.
       level: "compiled", "jax" or "plain"; by default compiled if the function is numba's, and plain otherwise.
     """
 

@@ -189,8 +189,8 @@ class Clearance(KeepsClear, Constraint):
 
     Args:
       world: the obstacles. For a robot in a plane they are reduced to that plane; see `World.seen_by`.
-      radius, balls, geoms: exactly one of them, as for an ObstacleCost: one distance for each ball, each hull of
-        several, or each body, and obstacle.
+      radius: exactly one of `radius`, `balls` and `geoms`, as for an ObstacleCost: one distance for each ball, each
+        hull of several, or each body, and obstacle.
       margin: margin in metres: a number, or one per knot, (T + 1,), or one per knot and obstacle, (T + 1, O). Margins
         of knots move with time when a `Replanner` plans again, as the rows of a `QuadraticCost`.
     """
