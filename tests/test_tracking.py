@@ -345,6 +345,7 @@ def test_they_are_the_same_in_any_units_of_the_controls(seed: int, unstable: boo
         np.testing.assert_allclose(one, another, rtol=0, atol=1e-5 * np.abs(one).max())
 
 
+@hypothesis.example(-8.0, 0.0)
 @hypothesis.given(st.floats(-8, 3), st.floats(-1, 1))
 @hypothesis.settings(max_examples=examples(25))
 def test_effects_of_a_parameter_are_its_derivatives_whatever_its_size(exponent: float, control: float) -> None:
@@ -364,7 +365,8 @@ def test_effects_of_a_parameter_are_its_derivatives_whatever_its_size(exponent: 
     plan = ls.Trajectory(np.array(states), controls, DT)
     model = PlanModel(PlanDerivatives(dynamics, plan), Uncertainty(unknowns=[Unknown("inertia", 0.1 * inertia)]))
     wanted = -(1.5 + control) / inertia * np.array([DT**2 / 2, DT])
-    np.testing.assert_allclose(model.effects[:, :, 0], np.tile(wanted, (4, 1)), rtol=1e-4)
+    # The step is at most 1 % of the inertia, that of the least one; the error is its square.
+    np.testing.assert_allclose(model.effects[:, :, 0], np.tile(wanted, (4, 1)), rtol=1.1e-4)
 
 
 def turning(x: Any, u: Any, p: Any) -> list[Any]:
