@@ -29,7 +29,7 @@ from lqrsim.control.controllers import Controller, ControllerRun, Feedback
 from lqrsim.errors import Array, InputError
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.disturbances import ControlNoise, ForceNoise
-from lqrsim.stress.campaign import Job, _code, run_campaign
+from lqrsim.stress.campaign import Job, _code, _sole_writer, run_campaign
 from lqrsim.stress.results import Columns, Damaged, Results, differences, replay, unpack
 from lqrsim.stress.study import Campaign, Cell, Shard, Trials
 
@@ -596,6 +596,14 @@ def test_one_writer_at_a_time(tmp_path: Path) -> None:
         holder.kill()
         holder.wait()
     assert run_campaign(campaign, tmp_path, workers=0).complete  # the lock of a dead process is none
+
+
+def test_the_lock_names_its_process_wherever_the_locked_byte_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lqrsim.stress.campaign._lock", lambda handle: os.lseek(handle, 1 << 20, os.SEEK_SET))
+    with _sole_writer(tmp_path):
+        assert (tmp_path / "campaign.lock").read_bytes() == f"{os.getpid()}\n".encode()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows locks in another way")

@@ -192,6 +192,7 @@ def _sole_writer(folder: Path) -> Iterator[None]:
             raise InputError(f"folder: got {got}") from None
         with contextlib.suppress(OSError):  # shows which process has the lock
             os.ftruncate(handle, 0)
+            os.lseek(handle, 0, os.SEEK_SET)  # on Windows a lock is far behind
             os.write(handle, f"{os.getpid()}\n".encode())
         yield
     finally:
