@@ -176,7 +176,7 @@ def report(
 def _text_and_tables(
     results: Results, table: analysis.Table, broken: Breaks, worst: Sequence[list[analysis.Trial]]
 ) -> dict[str, Any]:
-    campaign, scenario = results.campaign, results.trials.scenario
+    campaign, scenario = results.campaign, results.runner.scenario
     unit = tracking_unit(scenario.problem.dynamics.state_coordinates)
     finished = {cell: outcomes for cell, outcomes in table.items() if len(outcomes) == campaign.trials}
     erred = sum(int((outcomes.outcome == "error").sum()) for outcomes in table.values())
@@ -185,14 +185,14 @@ def _text_and_tables(
     if erred:
         warnings.append(f"{erred} trials ended with an error; they count as failures.")
     warnings += [f"{line}." for line in results.came_to_nothing()]
-    target = next(iter(results.trials.solutions.values())).target
+    target = next(iter(results.runner.solutions.values())).target
     radius = scenario.target_radius(campaign.goal_radius, campaign.goal_tolerance, target=target)
     return {
         "title": f"Stress test of {scenario.name}",
         "warnings": warnings,
         "facts": _facts(results, table),
         "commands": {"To resume or repair the campaign": results.command, "This page": results.command_of("report")},
-        "asked": json.dumps(results.manifest["campaign"], indent=2, ensure_ascii=False),
+        "asked": json.dumps(results.manifest.campaign, indent=2, ensure_ascii=False),
         "breaks": breaks_table(table, broken),
         "broken_below": f"{100 * BROKEN_BELOW:g} %",
         "reach": f"{radius:g} {target.unit} of the {target.name}",
@@ -206,7 +206,7 @@ def _text_and_tables(
 
 
 def _facts(results: Results, table: analysis.Table) -> dict[str, list[str]]:
-    campaign, manifest, scenario = results.campaign, results.manifest, results.trials.scenario
+    campaign, manifest, scenario = results.campaign, results.manifest, results.runner.scenario
     problem = scenario.problem
     facts = {
         "Scenario": [
@@ -215,7 +215,7 @@ def _facts(results: Results, table: analysis.Table) -> dict[str, list[str]]:
         ],
         "Disturbances, at strength 1": [f"{name}: {_describe(of, scenario)}" for name, of in campaign.sweeps.items()],
         "Strengths": [", ".join(f"{strength:g}" for strength in sorted({cell.strength for cell in table}))],
-        "Policies": [", ".join(policies(table)), *filter(None, [manifest["left_out"], *manifest["remarks"]])],
+        "Policies": [", ".join(policies(table)), *filter(None, [manifest.left_out, *manifest.remarks])],
         "Plans": results.plans(),
         "Trials": [
             f"{campaign.trials} of each combination, {sum(map(len, table.values()))} in all, with the same random"
@@ -231,8 +231,8 @@ def _facts(results: Results, table: analysis.Table) -> dict[str, list[str]]:
         lines += [f"Left out of the design: {'; '.join(unknown)}."] if unknown else []
     if lines:
         facts["Design disturbances"] = lines
-    facts["Versions"] = [", ".join(f"{name} {version}" for name, version in manifest["versions"].items())]
-    facts["Machine"] = [manifest["machine"]]
+    facts["Versions"] = [", ".join(f"{name} {version}" for name, version in manifest.versions.items())]
+    facts["Machine"] = [manifest.machine]
     return facts
 
 
@@ -242,7 +242,7 @@ def _describe(disturbances: Sequence[Disturbance], scenario: Scenario) -> str:
 
 
 def _sweep(name: str, results: Results, table: analysis.Table, folder: Path) -> dict[str, Any]:
-    scenario = results.trials.scenario
+    scenario = results.runner.scenario
     unit = tracking_unit(scenario.problem.dynamics.state_coordinates)
     of_sweep = {cell: outcomes for cell, outcomes in table.items() if cell.sweep == name}
     rates, errors = ({policy: dict[float, Array]() for policy in policies(of_sweep)} for _ in range(2))

@@ -103,7 +103,8 @@ def test_a_campaign_knows_which_cells_are_random(tmp_path: Path) -> None:
         strengths=(0.0, 1.0), policies=("smooth",), trials=2,
     )  # fmt: skip
     results = ls.stress.run_campaign(campaign, tmp_path, workers=0)
-    found = {(cell.sweep, cell.strength): one for cell, _, one in results.cell_successes() if one is not None}
+    summaries = results.cell_summaries().items()
+    found = {(cell.sweep, cell.strength): one.success for cell, one in summaries if one.success is not None}
     assert {key: one.alike for key, one in found.items() if key[1]} == {
         ("losses", 1.0): False, ("late", 1.0): True, ("both", 1.0): False, ("still", 1.0): False,
     }  # fmt: skip

@@ -490,7 +490,7 @@ def test_a_campaign_and_a_figure_of_plans_in_belief_space(tmp_path: Path) -> Non
     campaign = ls.stress.Campaign.of_sets(reference, ["scenario"], strengths=(1.0,), policies=("smooth",), trials=20)
     results = ls.stress.run_campaign(campaign, tmp_path / "runs", workers=0, batch=7)
     scenario, cell = campaign.resolved, results.cells[0]
-    solution = results.trials.solutions["smooth"]
+    solution = results.runner.solutions["smooth"]
     law = ls.belief.BeliefFeedback(scenario.problem, solution)
     options: dict[str, Any] = {"goal_radius": 0.1, "disturbances": scenario.disturbances}
     run = ls.simulate(scenario.plant(), controller=law, trials=20, frames=False, contacts=False, **options)

@@ -1,7 +1,9 @@
 """Campaigns: the same bits whatever happens on the way, and one line for what cannot be."""
 
+import contextlib
 import errno
 import io
+import itertools
 import multiprocessing
 import os
 import random
@@ -10,12 +12,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections import Counter
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pyarrow as pa
@@ -29,9 +32,9 @@ from lqrsim.control.controllers import Controller, ControllerRun, Feedback
 from lqrsim.errors import Array, InputError
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.disturbances import ControlNoise, ForceNoise
-from lqrsim.stress.campaign import Job, _code, _sole_writer, run_campaign
+from lqrsim.stress.campaign import Job, _code, _sole_writer, run_campaign, run_on_cluster
 from lqrsim.stress.results import Columns, Damaged, Results, differences, replay, unpack
-from lqrsim.stress.study import Campaign, Cell, Shard, Trials
+from lqrsim.stress.study import Campaign, Cell, Shard, TrialRunner
 
 OWN = """
 import dataclasses
@@ -243,6 +246,79 @@ def test_dask_does_the_same(reference: Results, tmp_path: Path) -> None:
     same_bits(tmp_path, reference)
 
 
+class Cluster:
+    """A client of a dask cluster of one worker at a time, which runs shards by a script of attempts, in time made up.
+
+    An attempt waits, then begins, and dies or ends after so many seconds: (wait, duration, whether its worker dies).
+    """
+
+    def __init__(self, scripts: Mapping[Shard, Sequence[tuple[float, float, bool]]]) -> None:
+        self.now, self.handlers, self.done = 0.0, dict[str, Callable[[tuple[float, Any]], object]](), set[Shard]()
+        self.restarted, self.workers, events = list[str](), itertools.count(), list[tuple[float, str, Any]]()
+        for shard, attempts in scripts.items():
+            at = 0.0
+            for wait, duration, dies in attempts:
+                worker, began = f"worker {next(self.workers)}", at + wait
+                at = began + duration
+                events.append((began, "job", [worker, [shard.cell_number, shard.first, shard.count]]))
+                events.append((at, "all", {"action": "remove-worker", "worker": worker}) if dies else (at, "", shard))
+        self.events = deque(sorted(events, key=lambda event: event[0]))
+
+    def subscribe_topic(self, topic: str, handler: Callable[[tuple[float, Any]], object]) -> None:
+        self.handlers[topic] = handler
+
+    def wait(self, *_: object, **__: object) -> None:
+        self.now += 0.5
+        while self.events and self.events[0][0] <= self.now:
+            at, topic, message = self.events.popleft()
+            if topic:
+                self.handlers.get(topic, lambda event: None)((at, message))
+            else:
+                self.done.add(message)
+
+    def submit(self, function: object, job: object, shard: Shard, **_: object) -> Any:
+        future = Mock(status="finished")
+        future.done, future.result = lambda: shard in self.done, lambda: b""
+        return future
+
+    def nthreads(self) -> dict[str, int]:
+        return dict.fromkeys(map(str, range(100)), 1)
+
+    def as_current(self) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext()
+
+    def restart_workers(self, workers: list[str], **_: object) -> None:
+        self.restarted += workers
+
+    def unsubscribe_topic(self, topic: str) -> None:
+        del self.handlers[topic]
+
+    def cancel(self, futures: object) -> None: ...
+
+
+def test_only_the_time_of_a_living_worker_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A shard whose worker dies waits until another begins it: only a run of more than the limit is stopped."""
+    distributed, limit, stopped = pytest.importorskip("distributed"), 10.0, 0
+    for seed in range(40):
+        draws = random.Random(seed)
+        scripts = dict[Shard, list[tuple[float, float, bool]]]()
+        for number in range(draws.randint(1, 4)):
+            deaths = [(draws.uniform(0, 30), draws.uniform(0, 9), True) for _ in range(draws.randint(0, 3))]
+            duration = draws.choice((draws.uniform(0, 9), draws.uniform(11, 30)))
+            scripts[Shard(0, number, 1)] = [*deaths, (draws.uniform(0, 30), duration, False)]
+        cluster = Cluster(scripts)
+        monkeypatch.setattr(distributed, "wait", cluster.wait)
+        monkeypatch.setattr("lqrsim.stress.campaign.time", SimpleNamespace(monotonic=lambda made=cluster: made.now))
+        job: Any = SimpleNamespace(name="job", errors=lambda shard, reason: reason.encode())
+        files = dict(run_on_cluster(job, [*scripts], cluster, limit))
+        for shard, attempts in scripts.items():
+            late = attempts[-1][1] > limit
+            assert files[shard] == (b"took longer than 10 s, and was stopped" if late else b"")
+            stopped += late
+        assert len(cluster.restarted) == sum(attempts[-1][1] > limit for attempts in scripts.values())
+    assert 20 < stopped < 80
+
+
 @LINUX
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 @pytest.mark.long
@@ -389,11 +465,11 @@ def test_a_policy_that_returns_nan_is_an_error(tmp_path: Path, monkeypatch: pyte
         def control(self, step: int, measured: Array) -> Array:
             return np.where(step == 20, np.nan, self.sane.control(step, measured))
 
-    def mad(own: Trials, cell: Cell) -> Controller | ls.AffinePolicy:
+    def mad(own: TrialRunner, cell: Cell) -> Controller | ls.AffinePolicy:
         plain = own.solutions[cell.policy].policy
         return Mad(plain) if cell.policy == "open_loop" else plain
 
-    monkeypatch.setattr(Trials, "controller", mad)
+    monkeypatch.setattr(TrialRunner, "controller", mad)
     results = run_campaign(CAMPAIGN, tmp_path, workers=0)
     nan = Cell("open_loop", "scenario", 1.0)
     assert results.tally(nan)["error"] > 15  # the others collide before
@@ -431,12 +507,12 @@ def test_a_damaged_shard_is_named_and_repaired(reference: Results, tmp_path: Pat
 def test_no_flipped_bit_is_missed(reference: Results) -> None:
     shard = next(reference.shards())
     contents, draws = reference.path(shard).read_bytes(), random.Random(0)
-    whole = unpack(contents, shard, reference.manifest["digest"])
+    whole = unpack(contents, shard, reference.manifest.digest)
     for _ in range(300):
         flipped = bytearray(contents)
         flipped[draws.randrange(len(flipped))] ^= 1 << draws.randrange(8)
         try:
-            table = unpack(bytes(flipped), shard, reference.manifest["digest"])
+            table = unpack(bytes(flipped), shard, reference.manifest.digest)
         except Damaged:
             continue
         assert all(table[name].tobytes() == whole[name].tobytes() for name in whole)  # in what nothing depends on
@@ -476,7 +552,7 @@ def test_what_is_in_a_shard_is_bounded_before_it_is_unpacked(
     pool = pa.default_memory_pool()
     before = pool.bytes_allocated()
     with pytest.raises(Damaged, match=says):
-        unpack(file.getvalue(), shard, reference.manifest["digest"])
+        unpack(file.getvalue(), shard, reference.manifest.digest)
     assert pool.bytes_allocated() - before < 1 << 20
 
 
@@ -808,7 +884,7 @@ def test_what_was_read_does_not_hide_what_is_written_later(reference: Results, t
     part = Results(folder)
 
     def done() -> list[int]:
-        return [ends.total() for _, ends, _ in part.cell_successes()]
+        return [so_far.ends.total() for so_far in part.cell_summaries().values()]
 
     assert done() == [4, 6]
     for path in later.iterdir():

@@ -44,7 +44,7 @@ from lqrsim.simulation.plant import Plant
 from lqrsim.stress.analysis import Outcomes, outcomes
 from lqrsim.stress.campaign import run_campaign
 from lqrsim.stress.results import Results, differences, replay
-from lqrsim.stress.study import Campaign, Trials
+from lqrsim.stress.study import Campaign, TrialRunner
 
 BENCH = """<geom name="floor" type="plane" size="2 2 0.1" pos="0 0 -0.5"/>
   <geom name="post" type="cylinder" size="0.05 0.5" pos="0.5 0.5 0"/>"""
@@ -689,7 +689,7 @@ def test_a_row_is_what_a_rollout_with_contacts_and_a_replay_say(rough: Results, 
     rollout = ls.simulate(
         cage, rough.solution("smooth"), disturbances=ROUGH.disturbances(cell), trials=300, frames=False
     )
-    again = outcomes(rollout, rough.trials.scenario.problem)
+    again = outcomes(rollout, rough.runner.scenario.problem)
     assert (table.outcome == "collided").sum() >= 3
     for name, column in again.columns().items():
         np.testing.assert_array_equal(column, table.columns()[name], err_msg=name)
@@ -821,10 +821,10 @@ def test_a_campaign_says_whose_filter_diverged(tmp_path: Path, monkeypatch: pyte
     # Estimates of drag that are negative make its predictions explode.
     wrong = ls.disturbances.Uncertainty(unknowns=[Unknown("drag", 3000.0)], measurement=0.02, start=0.01)
 
-    def controller(own: Trials, cell: Any) -> Controller | ls.AffinePolicy:
+    def controller(own: TrialRunner, cell: Any) -> Controller | ls.AffinePolicy:
         return ls.OffsetFree(scenario.problem, own.solutions[cell.policy], wrong, tolerate=tolerate)
 
-    monkeypatch.setattr(Trials, "controller", controller)
+    monkeypatch.setattr(TrialRunner, "controller", controller)
     noise = (MeasurementNoise(0.02), ForceNoise(1.0))
     campaign = replace(ROUGH, sweeps={"noise": noise}, strengths=(1.0,), trials=12)
     files = []
@@ -931,10 +931,10 @@ def test_in_a_campaign_only_those_trials_fail_that_fail_alone(
     rough: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     campaign = replace(ROUGH, strengths=(1.4,), trials=12)
-    alone = rough.trials.run(rough.cells[1], 0, 12, frames=False, contacts=False)
+    alone = rough.runner.run(rough.cells[1], 0, 12, frames=False, contacts=False)
     beyond = alone.measured[:, 7, 0] > np.median(alone.measured[:, 7, 0])
     monkeypatch.setitem(globals(), "FAR", float(np.median(alone.measured[:, 7, 0])))
-    monkeypatch.setattr(Trials, "controller", lambda own, cell: Failing(own.solutions[cell.policy], some))
+    monkeypatch.setattr(TrialRunner, "controller", lambda own, cell: Failing(own.solutions[cell.policy], some))
     files = []
     for batch in (12, 5):
         results = run_campaign(campaign, tmp_path / str(batch), workers=0, batch=batch)

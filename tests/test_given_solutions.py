@@ -138,7 +138,7 @@ def test_a_path_and_other_processes_give_the_same_bits(
     again = ls.stress.run_campaign(
         dataclasses.replace(CAMPAIGN, solution=stored), tmp_path, workers=0 if is_short() else 1, batch=3
     )
-    assert again.manifest["digest"] == results.manifest["digest"]
+    assert again.manifest.digest == results.manifest.digest
     assert shards(tmp_path) == shards(results.folder)
 
 
@@ -217,8 +217,8 @@ def test_a_campaign_that_solves_does_not_go_on_with_a_solution(left: ls.Solution
     found = solved.solution("smooth")
     given = ls.stress.run_campaign(dataclasses.replace(campaign, solution=found), tmp_path / "given", workers=0)
     assert ls.stress.Results(given.folder).campaign.solution == tmp_path / "given" / "solution.npz"
-    assert given.manifest["policies"]["smooth"]["digest"] == solved.manifest["policies"]["smooth"]["digest"]
-    assert given.manifest["digest"] != solved.manifest["digest"]
+    assert given.manifest.policies["smooth"]["digest"] == solved.manifest.policies["smooth"]["digest"]
+    assert given.manifest.digest != solved.manifest.digest
 
 
 def test_the_hash_is_of_all_that_solving_again_begins_with(left: ls.Solution, tmp_path: Path) -> None:
@@ -227,9 +227,9 @@ def test_the_hash_is_of_all_that_solving_again_begins_with(left: ls.Solution, tm
     assert left.cost_to_go is not None
     steeper = dataclasses.replace(left.cost_to_go, hessian=2 * left.cost_to_go.hessian)
     digests = {
-        ls.stress.run_campaign(dataclasses.replace(campaign, solution=one), tmp_path / str(number), workers=0).manifest[
-            "digest"
-        ]
+        ls.stress.run_campaign(
+            dataclasses.replace(campaign, solution=one), tmp_path / str(number), workers=0
+        ).manifest.digest
         for number, one in enumerate((left, dataclasses.replace(left, cost_to_go=steeper)))
     }
     assert len(digests) == 2

@@ -223,7 +223,7 @@ def test_a_policy_of_another_campaign_is_refused(folder: Path, finished: Path) -
 
 def test_results_name_the_processor(finished: Path, drive_solution: ls.Solution) -> None:
     assert drive_solution.versions["processor"] == machine.processor()
-    assert Results(finished).manifest["versions"]["processor"] == machine.processor()
+    assert Results(finished).manifest.versions["processor"] == machine.processor()
 
 
 def test_the_processor_is_the_one_that_code_is_compiled_for() -> None:

@@ -209,8 +209,8 @@ def test_a_campaign_does_not_go_on_with_another_start(own: Path, tmp_path: Path)
     with pytest.raises(ls.InputError, match=r"^scenario: got a start other than the one .*out was begun with"):
         ls.stress.run_campaign(campaign, folder, workers=0)
     other = ls.stress.run_campaign(campaign, tmp_path / "other", workers=0).manifest
-    assert other["problem"] == results.manifest["problem"]
-    assert other["digest"] != results.manifest["digest"]
+    assert other.problem == results.manifest.problem
+    assert other.digest != results.manifest.digest
 
 
 def with_part(whole: Any, name: str) -> Any:

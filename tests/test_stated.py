@@ -1,6 +1,5 @@
 """Policies that are made for stated disturbances, by name: in campaigns, searches for failures, and commands."""
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
@@ -105,10 +104,10 @@ def test_what_is_stated_is_written_down_and_part_of_the_digest(tmp_path: Path) -
     for number, stated in enumerate((None, (ControlNoise(0.1), MeasurementNoise(0.01)), LIGHT)):
         ls.stress.run_campaign(replace(small, design_disturbances=stated), tmp_path / str(number), workers=0)
         manifests.append(read_manifest(tmp_path / str(number)))
-    assert len({manifest["digest"] for manifest in manifests}) == 3
+    assert len({manifest.digest for manifest in manifests}) == 3
     with pytest.raises(InputError, match=r"^design_disturbances: got .*want .* or another folder"):
         ls.stress.run_campaign(replace(small, design_disturbances=LIGHT), tmp_path / "1", workers=0)
-    assert manifests[-1]["campaign"]["design_disturbances"][2] == {
+    assert manifests[-1].campaign["design_disturbances"][2] == {
         "kind": "AxleMismatch",
         "settings": {"std": 0.01, "factor": None},
     }
@@ -162,7 +161,7 @@ def test_a_design_is_made_for_what_the_summary_says(differential_drive: ls.Scena
         assert "track_per_cell: designed anew for the disturbances of each cell" in said
     assert ls.stress.Results(tmp_path / "here").designs() == results.designs()
     named = replace(campaign, design_disturbances=LIGHT)
-    results.manifest["campaign"] = json.loads(json.dumps(named.as_json()))
+    results.manifest = replace(results.manifest, campaign=named.as_json())
     assert results.designs()["track"].startswith("designed for ControlNoise(std=0.02), MeasurementNoise(std=0.01), ")
 
 

@@ -148,19 +148,19 @@ def of_campaign(results: "ls.stress.Results") -> Object:
     from lqrsim.results.goal import OUTCOMES
 
     cells = []
-    for cell, ends, success in results.cell_successes():
-        row = {**_fields(cell, "policy sweep strength"), "trials": ends.total()}
-        if success is not None:
-            outcomes = {name: ends[name] for name in OUTCOMES}
+    for cell, so_far in results.cell_summaries().items():
+        row = {**_fields(cell, "policy sweep strength"), "trials": so_far.ends.total()}
+        if (success := so_far.success) is not None:
+            outcomes = {name: so_far.ends[name] for name in OUTCOMES}
             row |= {"outcomes": outcomes, "reached": success.exact, "deterministic": success.alike}
         cells.append(row)
     return {
         **_fields(results, "folder complete"),
         "cells": cells,
-        "left_out": results.manifest["left_out"],
+        "left_out": results.manifest.left_out,
         "plans": results.plans(),
         "came_to_nothing": results.came_to_nothing(),
-        "versions": results.manifest["versions"],
+        "versions": results.manifest.versions,
     }
 
 

@@ -83,7 +83,7 @@ class Stress(SetupOptions):
         console.say(f"\nnext:\n  {results.command_of('report')}")
         if console.wants_result():
             console.result(campaign=console.of_campaign(results))
-        return 1 if any(ends["error"] for _, ends, _ in results.cell_successes()) else 0
+        return 1 if any(so_far.ends["error"] for so_far in results.cell_summaries().values()) else 0
 
 
 OwnScenario = Annotated[
@@ -118,7 +118,7 @@ class Replay:
         console.check_output("--out", self.out, "file")
         results = ls.stress.Results(self.folder, scenario=self.scenario)
         cell = ls.stress.Cell.named(self.cell, results.cells)
-        if others := changed(results.manifest["versions"]):
+        if others := changed(results.manifest.versions):
             console.say(f"values may differ from the table in the last bits: got {others}")
         rollout = ls.stress.replay(results, cell, self.trial)
         console.say(rollout.summary())
@@ -131,7 +131,7 @@ class Replay:
             console.say("identical to the table")
         console.save(rollout, self.out)
         if console.wants_result():
-            run = console.of_rollout(rollout, results.trials.scenario.problem)
+            run = console.of_rollout(rollout, results.runner.scenario.problem)
             console.result(cell=cell, run=run, differences=different)
         return 1 if different else 0
 

@@ -377,7 +377,7 @@ class Export:
             shards = ((cell, shard) for cell in cells for shard in results.shards(cell))
             runs = (ls.stress.replay(results, cell, one.first, trials=one.count, frames=False) for cell, one in shards)
             solution = self.solution or results.folder / "policies" / f"{cells[0].policy}.npz"
-            named = self.scenario or results.manifest["campaign"]["scenario"]
+            named = self.scenario or results.manifest.settings.scenario
             _ = results.campaign  # raises an exception if that is code which was not named
         else:
             if self.cell:

@@ -57,6 +57,7 @@ from lqrsim.stress.results import (
     SOLUTION_FILE,
     Columns,
     Damaged,
+    Manifest,
     Results,
     pack,
     read_manifest,
@@ -72,7 +73,7 @@ from lqrsim.stress.study import (
     Campaign,
     Cell,
     Shard,
-    Trials,
+    TrialRunner,
     check_used,
     design_uncertainty,
     impossible_policies,
@@ -145,11 +146,11 @@ def run_campaign(
         # What is run is what is replayed, also where a function makes another scenario each time.
         results.campaign = campaign
         unfinished = _unfinished(results)
-        if unfinished and (others := changed(results.manifest["versions"])):
+        if unfinished and (others := changed(results.manifest.versions)):
             want = f"the versions of {folder}, or another folder"
             raise InputError(f"versions: got {others}, which may change the last bits, want {want}")
         if unfinished:
-            warm_up(results.trials)  # done here first, so that the workers find everything compiled
+            warm_up(results.runner)  # done here first, so that the workers find everything compiled
         job = Job.of(results, batch)
         total = campaign.trials * len(results.cells)
         done = total - sum(shard.count for shard in unfinished)
@@ -159,13 +160,13 @@ def run_campaign(
         elif workers:
             work = run_in_processes(job, unfinished, min(workers, len(unfinished)), campaign.time_limit)
         else:
-            work = ((shard, job.work(shard, results.trials)) for shard in unfinished)
+            work = ((shard, job.work(shard, results.runner)) for shard in unfinished)
         for shard, contents in stack.enter_context(contextlib.closing(work)):
             write(contents, results.path(shard))
             done += shard.count
             tell(done, total)
-        for cell, ends, _ in results.cell_successes():
-            if (counted := ends.total()) != campaign.trials:
+        for cell, so_far in results.cell_summaries().items():
+            if (counted := so_far.ends.total()) != campaign.trials:
                 raise InputError(f"folder: got {counted} trials of {cell}, want {campaign.trials}: {results.command}")
     return results
 
@@ -329,11 +330,11 @@ def _begin(campaign: Campaign, specification: dict[str, Any], folder: Path) -> N
     })  # fmt: skip
 
 
-def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any], folder: Path) -> None:
+def _check_same_campaign(specification: dict[str, Any], manifest: Manifest, folder: Path) -> None:
     # Each sweep is compared as one field.
     now, before = (
         {f"sweeps: {name}": sweep for name, sweep in stated["sweeps"].items()} | {**stated, "sweeps": None}
-        for stated in (specification["campaign"], manifest["campaign"])
+        for stated in (specification["campaign"], manifest.campaign)
     )
     for name in [*now, *before]:
         value, was = now.get(name), before.get(name)
@@ -343,17 +344,17 @@ def _check_same_campaign(specification: dict[str, Any], manifest: dict[str, Any]
         ("model", "robot, MJCF, choice of obstacles, simulator or goal radius"), ("problem", "problem"),
         ("start", "start"),
     ):  # fmt: skip
-        if specification[name] != manifest[name]:
-            older = other_lqrsim(manifest["versions"])
+        if specification[name] != getattr(manifest, name):
+            older = other_lqrsim(manifest.versions)
             got = f"a {parts} other than the one {folder} was begun with"
             got += f", or with the hashes of {older}" if older else ""
             raise InputError(f"scenario: got {got}, want the same, or another folder")
-    if specification["solution"] != manifest["solution"]:
+    if specification["solution"] != manifest.solution:
         got = "none" if specification["solution"] is None else "another"
-        want = "none" if manifest["solution"] is None else folder / SOLUTION_FILE
+        want = "none" if manifest.solution is None else folder / SOLUTION_FILE
         raise InputError(f"solution: got {got}, want {want}, as {folder} was begun with, or another folder")
     for kind, digest in specification["code"].items():
-        if digest != manifest["code"].get(kind):
+        if digest != manifest.code.get(kind):
             raise InputError(f"{kind}: got a file that has changed since {folder} was begun, want it as it was then")
 
 
@@ -400,7 +401,7 @@ def _is_intact(results: Results, shard: Shard) -> bool:
     """Whether a shard's file is as it was written; if it is not, it is moved aside."""
     path = results.path(shard)
     try:
-        read_table(path, shard, results.manifest["digest"])
+        read_table(path, shard, results.manifest.digest)
     except Damaged as error:
         folder = results.folder / "damaged"
         try:
@@ -418,7 +419,7 @@ def _is_intact(results: Results, shard: Shard) -> bool:
 class Job:
     """Everything that a worker needs for a campaign."""
 
-    manifest: Mapping[str, Any]
+    manifest: Manifest
     solutions: Mapping[str, Solution]  # by policy
     batch: int
     # Differs in every run, even of the same campaign.
@@ -428,67 +429,66 @@ class Job:
     def of(cls, results: Results, batch: int) -> "Job":
         """The job of running a campaign's trials elsewhere. Its solutions lack the logs of their solves."""
         unused: dict[str, Any] = {"inverse_policy": None, "cost_to_come": None, "iterations": (), "candidates": ()}
-        solutions = {policy: replace(solution, **unused) for policy, solution in results.trials.solutions.items()}
+        solutions = {policy: replace(solution, **unused) for policy, solution in results.runner.solutions.items()}
         return cls(results.manifest, solutions, batch)
 
-    def prepare(self, *, here: bool = False) -> Trials:
-        """The trials of this job, kept in this process until there is another job.
+    def prepare(self, *, here: bool = False) -> TrialRunner:
+        """The runner of this job's trials, kept in this process until there is another job.
 
         Raises InputError if this is the driver's machine, and the code of the scenario has changed meanwhile. Elsewhere
         the files of its meshes may be in other folders, so that it is not compared.
         """
         if self.name not in _prepared:
             _prepared.clear()
-            manifest, stated = self.manifest, self.manifest["campaign"]
-            scenario = resolve(stated["scenario"])
-            digests = manifest["model"], manifest["problem"]
-            if here and (_digest_of_runs(scenario), scenario.problem.digest) != digests:
-                got = f"a worker for which {stated['scenario']} is another than the campaign's"
+            manifest, reference = self.manifest, self.manifest.settings.scenario
+            scenario = resolve(reference)
+            if here and (_digest_of_runs(scenario), scenario.problem.digest) != (manifest.model, manifest.problem):
+                got = f"a worker for which {reference} is another than the campaign's"
                 raise InputError(f"scenario: got {got}, want code that has not changed since the campaign was made")
-            trials = Trials(Campaign.from_json(stated, scenario), self.solutions)
-            warm_up(trials)
-            _prepared[self.name] = trials
+            runner = TrialRunner(Campaign.from_json(manifest.campaign, scenario), self.solutions)
+            warm_up(runner)
+            _prepared[self.name] = runner
         return _prepared[self.name]
 
-    def work(self, shard: Shard, trials: Trials | None = None) -> bytes:
-        """Run a shard in this process, with these trials if given. Returns its file.
+    def work(self, shard: Shard, runner: TrialRunner | None = None) -> bytes:
+        """Run a shard in this process, with this runner if there is one. Returns its file.
 
         It is simulated in batches. If a trial of a batch is an error, all its trials are run again one by one.
         """
-        trials = trials or self.prepare()
-        cell, last = trials.campaign.cells[shard.cell_number], shard.first + shard.count
+        runner = runner or self.prepare()
+        cell, end = runner.campaign.cells[shard.cell_number], shard.first + shard.count
         parts: list[Columns] = []
-        for first in range(shard.first, last, self.batch):
-            count = min(self.batch, last - first)
-            rows = _rows(trials, cell, first, count)
+        for first in range(shard.first, end, self.batch):
+            count = min(self.batch, end - first)
+            rows = _rows(runner, cell, first, count)
             alone = count > 1 and bool((rows["outcome"] == "error").any())
-            parts += [_rows(trials, cell, trial, 1) for trial in range(first, first + count)] if alone else [rows]
+            parts += [_rows(runner, cell, trial, 1) for trial in range(first, first + count)] if alone else [rows]
         table = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        return pack(table, shard, self.manifest["digest"])
+        return pack(table, shard, self.manifest.digest)
 
     def errors(self, shard: Shard, reason: str) -> bytes:
         """The file of a shard that could not be run: each of its trials is an error with this reason."""
-        return pack(_error_rows(shard.first, shard.count, reason), shard, self.manifest["digest"])
+        return pack(_error_rows(shard.first, shard.count, reason), shard, self.manifest.digest)
 
 
-_prepared: dict[str, Trials] = {}  # trials of the last job that this process worked for
+_prepared: dict[str, TrialRunner] = {}  # of the last job that this process worked for
 
 
-def warm_up(trials: Trials) -> None:
+def warm_up(runner: TrialRunner) -> None:
     """Compile everything, by running undisturbed trials."""
     options: dict[str, Any] = {"frames": False, "contacts": False, "threads": 1}
-    first = next(iter(trials.solutions.values()))
-    law = make_controller("feedback", trials.scenario, first)
-    outcomes(simulate(trials.plant, first, controller=law, **options), trials.scenario.problem)
-    filtered = [cell for cell in trials.campaign.cells if POLICY_KINDS[cell.policy].controller == "offset_free"]
+    first = next(iter(runner.solutions.values()))
+    law = make_controller("feedback", runner.scenario, first)
+    outcomes(simulate(runner.plant, first, controller=law, **options), runner.scenario.problem)
+    filtered = [cell for cell in runner.campaign.cells if POLICY_KINDS[cell.policy].controller == "offset_free"]
     for cell in filtered[:1]:  # to compile its filter, too
-        simulate(trials.plant, trials.solutions[cell.policy], controller=trials.controller(cell), **options)
+        simulate(runner.plant, runner.solutions[cell.policy], controller=runner.controller(cell), **options)
 
 
-def _rows(trials: Trials, cell: Cell, first: int, count: int) -> Columns:
+def _rows(runner: TrialRunner, cell: Cell, first: int, count: int) -> Columns:
     try:
-        rollout = trials.run(cell, first, count, frames=False, contacts=False)
-        table = outcomes(rollout, trials.scenario.problem).columns()
+        rollout = runner.run(cell, first, count, frames=False, contacts=False)
+        table = outcomes(rollout, runner.scenario.problem).columns()
     except Exception as error:  # a disturbance or a scenario may raise anything; it counts as failed trials
         return _error_rows(first, count, format_error(error))
     reasons = np.array(rollout.reasons, dtype=np.str_)
@@ -713,9 +713,17 @@ def run_on_cluster(job: Job, shards: list[Shard], client: Any, time_limit: float
 
     waiting = iter(shards)
     submitted: dict[Any, Shard] = {}
-    started: dict[Shard, tuple[str, float]] = {}  # the worker that began a shard, and the time
+    running: dict[Shard, tuple[str, float]] = {}  # the worker that runs a shard, and when it began
+
+    def forget(event: tuple[float, Any]) -> None:
+        """A worker has died: what it ran waits for another, and no time counts until that begins it."""
+        for shard, (worker, _) in [*running.items()]:
+            if event[1] == event[1] | {"action": "remove-worker", "worker": worker}:
+                del running[shard]
+
+    client.subscribe_topic("all", forget)
     client.subscribe_topic(
-        job.name, lambda event: started.update({Shard(*event[1][1]): (event[1][0], time.monotonic())})
+        job.name, lambda event: running.update({Shard(*event[1][1]): (event[1][0], time.monotonic())})
     )
     try:
         while True:
@@ -734,12 +742,12 @@ def run_on_cluster(job: Job, shards: list[Shard], client: Any, time_limit: float
                         raise CancelledError
                     done = future.status == "finished"
                     yield shard, future.result() if done else job.errors(shard, format_error(future.exception()))
-                elif time.monotonic() - started.get(shard, ("", time.monotonic()))[1] > time_limit:
+                elif (begun := running.get(shard)) and time.monotonic() - begun[1] > time_limit:
                     del submitted[future]
                     future.cancel()
                     # A thread that hangs cannot be stopped otherwise; the worker may have ended, or have no nanny.
                     with contextlib.suppress(Exception):
-                        client.restart_workers([started[shard][0]], timeout=30, raise_for_error=False)
+                        client.restart_workers([begun[0]], timeout=30, raise_for_error=False)
                     yield shard, job.errors(shard, f"took longer than {time_limit:g} s, and was stopped")
     except (CancelledError, asyncio.CancelledError):
         raise InputError(f"scheduler: got a scheduler that lost its tasks or was restarted, {RESUME}") from None

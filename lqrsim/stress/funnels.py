@@ -245,7 +245,7 @@ def funnel(
     Raises:
       KeyboardInterrupt: Ctrl-C; its `found` is the Funnel with the levels of the knots that are done, if any.
     """
-    runner = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads, seed)
+    runner = _Runner(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads, seed)
     plan, policy, tell = solution.trajectory, solution.policy, progress or (lambda done, total, text: None)
     space = policy.state_coordinates
     starts, names, test = level_test(
@@ -356,7 +356,7 @@ def check_funnel(
       between: range of levels relative to the funnel's: (0, 1) is inside, (1, 1.5) a shell outside.
       seed: seed of all random numbers; it must differ from the funnel's, because the trials must be new.
     """
-    runner = _Trials(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads, seed)
+    runner = _Runner(plant, solution, disturbances, controller, (goal_radius, goal_tolerance), threads, seed)
     if not np.array_equal(solution.trajectory.states, funnel.plan.states):
         raise InputError("solution: got a plan other than the funnel's, want the funnel's own solution")
     if not between[0] < between[1]:
@@ -384,7 +384,7 @@ def points_of(numbers: npt.NDArray[np.intp], seed: int, size: int, between: tupl
     return points
 
 
-class _Trials:
+class _Runner:
     """Runs trials of a seed from states in the ellipsoids of a funnel; see `simulate_from`."""
 
     def __init__(

@@ -38,7 +38,7 @@ from lqrsim.simulation.disturbances import PRESETS
 from lqrsim.stress import analysis
 from lqrsim.stress.analysis import COLUMNS, Outcomes, outcomes
 from lqrsim.stress.statistics import CONFIDENCE
-from lqrsim.stress.study import CAMPAIGN_FIELDS, DEFAULT_DESIGN, POLICY_KINDS, Campaign, Cell, Shard, Trials
+from lqrsim.stress.study import CAMPAIGN_FIELDS, DEFAULT_DESIGN, POLICY_KINDS, Campaign, Cell, Shard, TrialRunner
 
 Columns = dict[str, npt.NDArray[np.generic]]  # of the table of a shard, by name
 _KEY = b"lqrsim shard"
@@ -62,13 +62,13 @@ _METHOD = {
 
 
 @dataclass(frozen=True)
-class _SoFar:
-    """What a summary says of a cell, by the shards that it has: small, unlike their rows."""
+class CellSummary:
+    """What the trials of a cell say so far, by the shards that it has: small, unlike their rows."""
 
     shards: list[Shard]
-    ends: Counter[str]
-    reasons: Counter[str]
-    success: analysis.Success | None
+    ends: Counter[str]  # the number of trials of each outcome
+    reasons: Counter[str]  # the number of trials that each reason stopped
+    success: analysis.Success | None  # None if no trial has been run
 
 
 class Results:
@@ -89,10 +89,10 @@ class Results:
     ) -> None:
         self.folder = check_path("folder", folder, "the path of a campaign's folder")
         self.manifest = read_manifest(self.folder)
-        self.cells = [Cell(*cell) for cell in self.manifest["cells"]]
+        self.cells = self.manifest.settings.cells
         self._scenario = scenario
-        self._known, self._solutions = dict[Cell, _SoFar](), dict[str, Solution]()
-        reference = self.manifest["campaign"]["scenario"]
+        self._known, self._solutions = dict[Cell, CellSummary](), dict[str, Solution]()
+        reference = self.manifest.settings.scenario
         if scenario is not None:
             named, known = (os.path.normpath(from_anywhere(text)) for text in (scenario, reference))
             if named != known:
@@ -101,15 +101,14 @@ class Results:
     @cached_property
     def campaign(self) -> Campaign:
         """The campaign. Raises InputError if its scenario is your own function, and no scenario was given."""
-        stated = self.manifest["campaign"]
-        scenario = resolve(stated["scenario"], registered_only=self._scenario is None)
-        given = None if self.manifest["solution"] is None else self.folder / SOLUTION_FILE
-        return Campaign.from_json(stated, scenario, given)
+        scenario = resolve(self.manifest.settings.scenario, registered_only=self._scenario is None)
+        given = None if self.manifest.solution is None else self.folder / SOLUTION_FILE
+        return Campaign.from_json(self.manifest.campaign, scenario, given)
 
     @cached_property
-    def trials(self) -> Trials:
+    def runner(self) -> TrialRunner:
         """Runs the campaign's trials. Raises InputError as `campaign` does, or if a policy is damaged."""
-        return Trials(self.campaign, {policy: self.solution(policy) for policy in self.campaign.policies})
+        return TrialRunner(self.campaign, {policy: self.solution(policy) for policy in self.campaign.policies})
 
     @property
     def complete(self) -> bool:
@@ -131,50 +130,44 @@ class Results:
             raise InputError(f"cell: got {cell}, of which no trial has been run, want one that was begun")
         names = [name for name in tables[0] if name != "reason"]
         columns: dict[str, Any] = {name: np.concatenate([table[name] for table in tables]) for name in names}
-        deterministic = not cell.strength or [cell.sweep, cell.strength] in self.manifest["deterministic"]
+        deterministic = not cell.strength or [cell.sweep, cell.strength] in self.manifest.deterministic
         found = Outcomes(**columns, deterministic=deterministic)
         reasons = Counter(reason for table in tables for reason in table["reason"].tolist() if reason)
-        # What a summary says of them, so that it reads no table again.
-        self._known[cell] = _SoFar(shards, Counter(found.outcome.tolist()), reasons, found.success)
+        self._known[cell] = CellSummary(shards, Counter(found.outcome.tolist()), reasons, found.success)
         return found
-
-    def _so_far(self, cell: Cell) -> _SoFar:
-        """What the shards of a cell say. They never change, so they are read again only if there are others."""
-        if not (shards := self._to_read(cell, partial=True)):
-            return _SoFar([], Counter(), Counter(), None)
-        if cell not in self._known or self._known[cell].shards != shards:
-            self.outcomes(cell, partial=True)
-        return self._known[cell]
 
     def tally(self, cell: Cell, *, partial: bool = False) -> Counter[str]:
         """The number of trials of each outcome of a cell, which need not be finished if `partial`."""
         return Counter(end for table in self.tables(cell, partial=partial) for end in table["outcome"].tolist())
 
-    def cell_successes(self) -> Iterator[tuple[Cell, Counter[str], analysis.Success | None]]:
-        """Each cell with its outcomes so far and its success rate, None if no trial has been run."""
+    def cell_summaries(self) -> dict[Cell, CellSummary]:
+        """The summary of each cell. Shards never change, so they are read again only if there are others."""
         for cell in self.cells:
-            known = self._so_far(cell)
-            yield cell, known.ends, known.success
+            if not (shards := self._to_read(cell, partial=True)):
+                self._known[cell] = CellSummary([], Counter(), Counter(), None)
+            elif cell not in self._known or self._known[cell].shards != shards:
+                self.outcomes(cell, partial=True)
+        return {cell: self._known[cell] for cell in self.cells}
 
     def summary(self) -> str:
         """A line per cell with success rate, interval and outcomes; then where the plans end, and errors."""
-        width = max(len(name) for name in ["sweep", *self.manifest["campaign"]["sweeps"]])
-        wide = max(10, *(len(policy) for policy in self.manifest["policies"]))
+        width = max(len(name) for name in ["sweep", *self.manifest.settings.sweeps])
+        wide = max(10, *(len(policy) for policy in self.manifest.policies))
         others = [name for name in OUTCOMES if name != "reached"]
         interval = f"reached, {100 * CONFIDENCE:g} % interval"
         head = f"{'sweep':<{width}} {'strength':>8} {'policy':<{wide}} {interval:>33}"
         lines = [head + "".join(f" {name:>9}" for name in others)]
-        for cell, ends, success in self.cell_successes():
-            if success is None:
+        for cell, so_far in self.cell_summaries().items():
+            if (success := so_far.success) is None:
                 continue
             exact, reached = success.exact, f"{success.reached}/{success.trials}"
             rate = f"{100 * exact.value:5.1f} [{100 * exact.low:5.1f}, {100 * exact.high:5.1f}]"
             rate = f"{reached:>13} {'deterministic: 1 run' if success.alike else rate}"
             line = f"{cell.sweep:<{width}} {cell.strength:>8g} {cell.policy:<{wide}} {rate:>33}"
-            lines.append(line + "".join(f" {ends[name]:>9}" for name in others))
-        lines += [self.manifest["left_out"]] if self.manifest["left_out"] else []
+            lines.append(line + "".join(f" {so_far.ends[name]:>9}" for name in others))
+        lines += [self.manifest.left_out] if self.manifest.left_out else []
         designs = (f"{policy}: {text}" for policy, text in self.designs().items())
-        lines += [*self.manifest["remarks"], *designs, *self.plans()]
+        lines += [*self.manifest.remarks, *designs, *self.plans()]
         lines += [*self.came_to_nothing(), *self.hints()]
         return "\n".join(lines)
 
@@ -187,22 +180,22 @@ class Results:
         """
         head = ("sweep", "strength", "policy", "trials", *OUTCOMES, "success", "low", "high")
         rows: list[tuple[Any, ...]] = []
-        for cell, ends, success in self.cell_successes():
+        for cell, so_far in self.cell_summaries().items():
             rate = (None, None, None)
-            if success is not None:
+            if (success := so_far.success) is not None:
                 interval = (None, None) if success.alike else (success.exact.low, success.exact.high)
                 rate = (success.exact.value, *interval)
-            counts = (ends.total(), *(ends[name] for name in OUTCOMES))
+            counts = (so_far.ends.total(), *(so_far.ends[name] for name in OUTCOMES))
             rows.append((cell.sweep, cell.strength, cell.policy, *counts, *rate))
-        campaign = self.manifest["campaign"]
+        settings = self.manifest.settings
         notes = [
-            f"{campaign['scenario']}, seed {campaign['seed']}; success: the fraction of trials that reached the goal",
+            f"{settings.scenario}, seed {settings.seed}; success: the fraction of trials that reached the goal",
             f"low, high: exact (Clopper-Pearson) interval of {100 * CONFIDENCE:g} %; none if all trials are one run",
             *(f"{policy}: {text}" for policy, text in self.designs().items()),
         ]
         if missing := sum(count for _, _, count in self.missing):
-            notes.append(f"not finished: {missing} of {campaign['trials'] * len(self.cells)} trials are missing")
-        formats: dict[str, str] = dict.fromkeys(("success", "low", "high"), fraction_format(campaign["trials"]))
+            notes.append(f"not finished: {missing} of {settings.trials * len(self.cells)} trials are missing")
+        formats: dict[str, str] = dict.fromkeys(("success", "low", "high"), fraction_format(settings.trials))
         return DataTable(dict(zip(head, zip(*rows, strict=True), strict=True)), formats, notes)
 
     def _repr_html_(self) -> str:
@@ -210,12 +203,12 @@ class Results:
 
     def designs(self) -> dict[str, str]:
         """For which disturbances each policy was designed that is designed for any, by policy."""
-        stated, designs = self.manifest["campaign"]["design_disturbances"], dict[str, str]()
+        stated, designs = self.manifest.campaign["design_disturbances"], dict[str, str]()
         disturbances = f"the preset {DEFAULT_DESIGN}"
         if stated is not None:  # as it is written in Python
             settings = (", ".join(f"{name}={value}" for name, value in item["settings"].items()) for item in stated)
             disturbances = ", ".join(f"{item['kind']}({text})" for item, text in zip(stated, settings, strict=True))
-        for policy in self.manifest["policies"]:
+        for policy in self.manifest.policies:
             kind = POLICY_KINDS[policy]
             if kind.designed:
                 designs[policy] = f"designed for {disturbances}, whatever the disturbances of a cell"
@@ -226,8 +219,8 @@ class Results:
     def came_to_nothing(self) -> list[str]:
         """A line for each of the most frequent reasons of trials that ended with an error or diverged."""
         reasons: Counter[str] = Counter()
-        for cell in self.cells:
-            reasons.update(self._so_far(cell).reasons)
+        for so_far in self.cell_summaries().values():
+            reasons.update(so_far.reasons)
         return [f"{count} trials were stopped: {reason}" for reason, count in reasons.most_common(MOST_REASONS)]
 
     def hints(self) -> list[str]:
@@ -236,10 +229,10 @@ class Results:
         Trials that ended with an error do not count.
         """
         reached: Counter[str] = Counter()
-        for cell, ends, _ in self.cell_successes():
-            if cell.strength > 0 and ends["error"] < ends.total():
-                reached[cell.sweep] += ends["reached"]
-        sweeps = self.manifest["campaign"]["sweeps"]
+        for cell, so_far in self.cell_summaries().items():
+            if cell.strength > 0 and so_far.ends["error"] < so_far.ends.total():
+                reached[cell.sweep] += so_far.ends["reached"]
+        sweeps = self.manifest.campaign["sweeps"]
         kinds = {name: [f"{name}:{item['kind']}" for item in sweeps[name]] for name in reached if name in PRESETS}
         return [
             f"{name}: no trial reached the goal; each kind of disturbance alone: --sweep {' '.join(kinds[name])}"
@@ -249,10 +242,10 @@ class Results:
 
     def plans(self) -> list[str]:
         """Lines that say where the plan of each policy ends, and whether it misses the goal."""
-        campaign, lines = self.manifest["campaign"], []
-        for policy in self.manifest["policies"]:
+        settings, lines = self.manifest.settings, []
+        for policy in self.manifest.policies:
             solution = self.solution(policy)
-            goal, radius = (campaign["goal_radius"], campaign["goal_tolerance"]), solution.goal_radius
+            goal, radius = (settings.goal_radius, settings.goal_tolerance), solution.goal_radius
             radius = radius if goal == (None, None) else solution.target.radius(None, *goal)
             lines += [f"{policy}: {line}" for line in solution.target.of_plan(radius)]
         return lines
@@ -268,17 +261,17 @@ class Results:
 
     def solution(self, policy: str) -> Solution:
         """The solution that a policy runs, read once."""
-        if check_name("policy", policy, self.manifest["policies"]) in self._solutions:
+        if check_name("policy", policy, self.manifest.policies) in self._solutions:
             return self._solutions[policy]
         path = self.folder / "policies" / f"{policy}.npz"
-        hashes, solution = self.manifest["policies"][policy], save_load.load(path, Solution)
+        hashes, solution = self.manifest.policies[policy], save_load.load(path, Solution)
         if sha256(path.read_bytes()) != hashes["sha256"] or digest_of_solution(solution) != hashes["digest"]:
             raise InputError(f"policy: got {path}, which is damaged, want another folder for the campaign")
         return self._solutions.setdefault(policy, solution)
 
     def shards(self, cell: Cell | None = None) -> Iterator[Shard]:
         """The shards of a cell; by default of all cells."""
-        trials, size = self.manifest["campaign"]["trials"], self.manifest["campaign"]["shard"]
+        trials, size = self.manifest.settings.trials, self.manifest.settings.shard
         for number in range(len(self.cells)) if cell is None else [self.number(cell)]:
             for first in range(0, trials, size):
                 yield Shard(number, first, min(size, trials - first))
@@ -318,20 +311,20 @@ class Results:
             trials = f"{shard.first} to {shard.first + shard.count - 1}"
             raise InputError(f"cell: got {self.cells[shard.cell_number]} without trials {trials}, run: {self.command}")
         try:
-            return read_table(path, shard, self.manifest["digest"])
+            return read_table(path, shard, self.manifest.digest)
         except Damaged as error:
             raise InputError(f"shard: got {path}, which is damaged ({error}), run: {self.command}") from None
 
     @property
     def command(self) -> str:
         """The command line that resumes the campaign and repairs damaged files. It runs in any working directory."""
-        reference = self.manifest["campaign"]["scenario"]
+        reference = self.manifest.settings.scenario
         return shlex.join(["lqrsim", "stress", reference, "--resume", "--out", str(self.folder.absolute())])
 
     @checked
     def command_of(self, command: Literal["report", "replay"], *options: str) -> str:
         """The command line of `lqrsim report` or `lqrsim replay` for this campaign, in any working directory."""
-        reference = self.manifest["campaign"]["scenario"]
+        reference = self.manifest.settings.scenario
         code = ["--scenario", reference] if names_code(reference) else []
         return shlex.join(["lqrsim", command, str(self.folder.absolute()), *options, *code])
 
@@ -348,17 +341,17 @@ def replay(
 ) -> Rollout:
     """Run trials of a campaign again: bit-identical until they end, and without contacts until the plan ends.
 
-    It needs the kind of processor and the versions in `results.manifest["versions"]`.
+    It needs the kind of processor and the versions in `results.manifest.versions`.
 
     Args:
       contacts: whether obstacles stop the robot.
     """
     results = results if isinstance(results, Results) else Results(results)
     results.number(cell)
-    last = results.manifest["campaign"]["trials"] - 1
+    last = results.manifest.settings.trials - 1
     if trial + trials - 1 > last:
         raise InputError(f"trial: got {trial} to {trial + trials - 1}, want numbers up to {last}")
-    return results.trials.run(cell, trial, trials, frames=frames, contacts=contacts)
+    return results.runner.run(cell, trial, trials, frames=frames, contacts=contacts)
 
 
 def differences(results: Results, cell: Cell, trial: int, again: Rollout) -> list[str]:
@@ -368,7 +361,7 @@ def differences(results: Results, cell: Cell, trial: int, again: Rollout) -> lis
     """
     shard = next(shard for shard in results.shards(cell) if trial < shard.first + shard.count)
     was = {name: column[trial - shard.first] for name, column in results.table(shard).items()}
-    now = outcomes(again, results.trials.scenario.problem).columns()
+    now = outcomes(again, results.runner.scenario.problem).columns()
     return [
         f"{name}: {value[0]} (in the table: {was[name]})"
         for name, value in now.items()
@@ -405,11 +398,11 @@ def compare(
     opened = [campaign if isinstance(campaign, Results) else Results(campaign) for campaign in given]
     results, chosen = (opened[0], opened[-1]), policies or ()
     manifests = [campaign.manifest for campaign in results]
-    campaigns = [manifest["campaign"] for manifest in manifests]
+    settings = [manifest.settings for manifest in manifests]
     if len(chosen) != 2 and (second is None or policies is not None):
         raise InputError(f"policies: got {excerpt(policies)}, want two policies, or another campaign to compare with")
-    for policy, campaign in zip(chosen, campaigns, strict=False):
-        check_name("policies", policy, campaign["policies"])
+    for policy, campaign in zip(chosen, settings, strict=False):
+        check_name("policies", policy, campaign.policies)
     matches = (
         (cell, Cell(chosen[1] if chosen else cell.policy, cell.sweep, cell.strength))
         for cell in results[0].cells
@@ -420,21 +413,22 @@ def compare(
         cells = results[1].cells
         raise InputError(f"second: got cells from {cells[0]} to {cells[-1]}, want some of the first's")
     for sweep in dict.fromkeys(cell.sweep for cell, _ in pairs):
-        if campaigns[0]["sweeps"][sweep] != campaigns[1]["sweeps"][sweep]:
+        if manifests[0].campaign["sweeps"][sweep] != manifests[1].campaign["sweeps"][sweep]:
             raise InputError(f"second: got other disturbances in the sweep {excerpt(sweep)}, want those of the first")
     for name in ("goal_radius", "goal_tolerance"):
-        if campaigns[0][name] != campaigns[1][name]:
-            raise InputError(f"second: {name}: got {campaigns[1][name]}, want {campaigns[0][name]}, as the first has")
-    paired = campaigns[0]["seed"] == campaigns[1]["seed"]
-    trials = [campaign["trials"] for campaign in campaigns]
+        want, got = (getattr(campaign, name) for campaign in settings)
+        if got != want:
+            raise InputError(f"second: {name}: got {got}, want {want}, as the first has")
+    paired = settings[0].seed == settings[1].seed
+    trials = [campaign.trials for campaign in settings]
     counts = [min(trials)] * 2 if paired else trials
     firsts = {cell: results[0].outcomes(cell).first(counts[0]) for cell, _ in pairs}
     seconds = {cell: results[1].outcomes(cell).first(counts[1]) for _, cell in pairs}
     comparisons = analysis.compare_cells(pairs, firsts, seconds, paired=paired)
     of = [f"{policy} of " for policy in chosen] or ["", ""]
     notes = [f"first: {of[0]}{results[0].folder}; second: {of[1]}{results[1].folder}"]
-    differ = [name for name in _SETTINGS if campaigns[0][name] != campaigns[1][name]]
-    differ += [name for name in _FIELDS if manifests[0][name] != manifests[1][name]]
+    differ = [name for name in _SETTINGS if manifests[0].campaign[name] != manifests[1].campaign[name]]
+    differ += [name for name in _FIELDS if getattr(manifests[0], name) != getattr(manifests[1], name)]
     notes += [f"they differ in {', '.join(differ)}"] if differ else []
     method = f"difference: first minus second; low, high: {100 * CONFIDENCE:g} % by {_METHOD[paired]}, adjusted (Holm)"
     notes = [*map(printable, notes), method]
@@ -462,20 +456,20 @@ def _table(pairs: Sequence[analysis.Comparison], notes: Sequence[str], *, paired
 
 @checked
 @dataclass(frozen=True)
-class _Manifest:
-    """The fields of the manifest; `Campaign` checks the campaign's fields."""
+class Manifest:
+    """What the manifest says."""
 
     format: Line
     version: int
-    campaign: Mapping[str, object]
+    campaign: Mapping[str, Any]  # from `Campaign.as_json`
     model: Line
     problem: Line
     start: Line | None
     solution: Line | None
     code: Mapping[str, Line | None]
     policies: Mapping[str, Mapping[str, Line]]
-    cells: object
-    deterministic: object
+    cells: Any
+    deterministic: Any
     versions: Mapping[str, Line]
     digest: Line
     machine: Line
@@ -483,17 +477,47 @@ class _Manifest:
     remarks: tuple[Line, ...]
     sha256: Line
 
+    @cached_property
+    def settings(self) -> Campaign:
+        """The campaign without disturbances: they may be a user's, and the user's file is not loaded here."""
+        sweeps = dict.fromkeys(self.campaign["sweeps"], ())
+        return Campaign(**{**self.campaign, "sweeps": sweeps, "design_disturbances": None})
+
+    @classmethod
+    def of(cls, said: Mapping[str, Any]) -> "Manifest":
+        """The manifest of an object of JSON. Raises InputError unless all fields are valid and the hashes fit."""
+        _check_names("manifest", said, [field.name for field in fields(cls)])
+        manifest = cls(**said)
+        if manifest.sha256 != _seal(said):
+            raise InputError("sha256: got a hash that does not fit the content, want an unchanged file")
+        _check_names("campaign", manifest.campaign, CAMPAIGN_FIELDS)
+        cells = [[cell.policy, cell.sweep, cell.strength] for cell in manifest.settings.cells]
+        if canonical(manifest.cells) != canonical(cells):
+            raise InputError("cells: got cells of another campaign, want each sweep, strength and policy")
+        pairs, fixed = [[sweep, strength] for _, sweep, strength in cells], manifest.deterministic
+        if not isinstance(fixed, list) or any(pair not in pairs for pair in fixed):
+            raise InputError(f"deterministic: got {excerpt(fixed)}, want a list of pairs of a sweep and a strength")
+        policies = manifest.settings.policies
+        if set(manifest.policies) != set(policies):
+            raise InputError(f"policies: got {', '.join(manifest.policies)}, want {', '.join(policies)}")
+        for policy, hashes in manifest.policies.items():
+            if hashes.keys() != {"digest", "sha256"}:
+                raise InputError(f"policies: {policy}: got {excerpt(dict(hashes))}, want digest and sha256")
+        if manifest.digest != digest_of_rows(said):
+            raise InputError("digest: got a hash that does not fit the campaign, want an unchanged file")
+        return manifest
+
 
 def write_manifest(folder: Path, contents: dict[str, Any]) -> None:
     """Write the manifest: `contents`, with format and hashes added. Raises InputError."""
     manifest = {"format": FORMAT, "version": VERSION, **contents}
     manifest["digest"] = digest_of_rows(manifest)
     manifest["sha256"] = _seal(manifest)
-    _check(parse(json.dumps(manifest)))  # without sorting: the sweeps define the order of the cells
+    Manifest.of(parse(json.dumps(manifest)))  # without sorting: the sweeps define the order of the cells
     write(json.dumps(manifest, indent=1).encode(), folder / MANIFEST)
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
+def read_manifest(folder: Path) -> Manifest:
     """Read the manifest of a folder. Raises InputError if it is missing, damaged, edited, or of another version."""
     path = folder / MANIFEST
     if not os.path.isfile(path):
@@ -501,38 +525,13 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     with blamed(path, "folder"):
         if path.stat().st_size > _LARGEST:
             raise InputError(f"size: got {path.stat().st_size:,} bytes, want at most {_LARGEST:,}")
-        manifest = parse(path.read_text(encoding="utf-8"))
-        if not isinstance(manifest, dict):
-            raise InputError(f"manifest: got {excerpt(manifest)}, want an object")
-        if (manifest.get("format"), manifest.get("version")) != (FORMAT, VERSION):
-            was = f"a {excerpt(manifest.get('format'))} {excerpt(manifest.get('version'))}"
+        said = parse(path.read_text(encoding="utf-8"))
+        if not isinstance(said, dict):
+            raise InputError(f"manifest: got {excerpt(said)}, want an object")
+        if (said.get("format"), said.get("version")) != (FORMAT, VERSION):
+            was = f"a {excerpt(said.get('format'))} {excerpt(said.get('version'))}"
             raise Other(f"folder: got {path}, {was}, want a {FORMAT!r} {VERSION}")
-        _check(manifest)
-    return manifest
-
-
-def _check(manifest: dict[str, Any]) -> None:
-    """Raise InputError unless all fields are there and valid, and the hashes fit."""
-    _check_names("manifest", manifest, [field.name for field in fields(_Manifest)])
-    _Manifest(**manifest)
-    if manifest["sha256"] != _seal(manifest):
-        raise InputError("sha256: got a hash that does not fit the content, want an unchanged file")
-    campaign = manifest["campaign"]
-    _check_names("campaign", campaign, CAMPAIGN_FIELDS)
-    # Disturbances are left out: they may be a user's, and the user's file is not loaded here.
-    bare = Campaign(**{**campaign, "sweeps": dict.fromkeys(campaign["sweeps"], ()), "design_disturbances": None})
-    if canonical(manifest["cells"]) != canonical([[cell.policy, cell.sweep, cell.strength] for cell in bare.cells]):
-        raise InputError("cells: got cells of another campaign, want each sweep, strength and policy")
-    pairs = [[sweep, strength] for _, sweep, strength in manifest["cells"]]
-    if not isinstance(fixed := manifest["deterministic"], list) or any(pair not in pairs for pair in fixed):
-        raise InputError(f"deterministic: got {excerpt(fixed)}, want a list of pairs of a sweep and a strength")
-    if set(manifest["policies"]) != set(campaign["policies"]):
-        raise InputError(f"policies: got {', '.join(manifest['policies'])}, want {', '.join(campaign['policies'])}")
-    for policy, hashes in manifest["policies"].items():
-        if hashes.keys() != {"digest", "sha256"}:
-            raise InputError(f"policies: {policy}: got {excerpt(dict(hashes))}, want digest and sha256")
-    if manifest["digest"] != digest_of_rows(manifest):
-        raise InputError("digest: got a hash that does not fit the campaign, want an unchanged file")
+        return Manifest.of(said)
 
 
 def _check_names(field: str, part: Mapping[str, Any], names: Sequence[str]) -> None:

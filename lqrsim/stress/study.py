@@ -2,7 +2,7 @@
 
 A study is one policy of a scenario under disturbances; a campaign is many, with trials of each. Both are plain data,
 which converts to JSON and back, and state the same `Setup`. A study becomes a plant and a controller in
-`Study.closed_loop`, a campaign in `Trials`.
+`Study.closed_loop`, a campaign in `TrialRunner`.
 """
 
 import dataclasses
@@ -441,7 +441,7 @@ class Campaign(Setup):
 CAMPAIGN_FIELDS = tuple(field.name for field in dataclasses.fields(Campaign) if field.name != "solution")
 
 
-class Trials:
+class TrialRunner:
     """Runs the trials of a campaign's cells, each policy with its solution."""
 
     def __init__(self, campaign: Campaign, solutions: Mapping[str, Solution]) -> None:

@@ -239,7 +239,7 @@ def campaign(folder: Path) -> Path:
 def everything(results: Results) -> Any:
     """All tables of a campaign."""
     results.summary()
-    policies = [results.solution(policy) for policy in results.manifest["policies"]]
+    policies = [results.solution(policy) for policy in results.manifest.policies]
     return tuple(results.cells), tuple(results.outcomes(cell) for cell in results.cells), tuple(policies)
 
 
