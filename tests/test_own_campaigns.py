@@ -69,7 +69,7 @@ def test_printed_commands_run_as_printed(
     (tmp_path / "another place").mkdir()
     monkeypatch.chdir(tmp_path / "another place")
     with pytest.raises(ls.InputError, match="code"):  # a file never chooses code to run
-        _ = Results(elsewhere / folder).trials
+        _ = Results(elsewhere / folder).runner
     for line in printed:
         program, *words = shlex.split(line)
         assert program == "lqrsim"

@@ -151,7 +151,10 @@ def run_campaign(
             raise InputError(f"versions: got {others}, which may change the last bits, want {want}")
         if unfinished:
             warm_up(results.runner)  # done here first, so that the workers find everything compiled
-        job = Job.of(results, batch)
+        # Without the logs of their solves, which workers do not need.
+        unused: dict[str, Any] = {"inverse_policy": None, "cost_to_come": None, "iterations": (), "candidates": ()}
+        solutions = {policy: replace(solution, **unused) for policy, solution in results.runner.solutions.items()}
+        job = Job(results.manifest, solutions, batch)
         total = campaign.trials * len(results.cells)
         done = total - sum(shard.count for shard in unfinished)
         tell(done, total)
@@ -253,36 +256,32 @@ def _check_runnable(campaign: Campaign) -> None:
 
 def _drawing_nothing(campaign: Campaign) -> list[list[Any]]:
     """The sweeps and strengths at which nothing is drawn. Raises InputError if a disturbance does not fit the robot."""
+    problem, plant = campaign.resolved.problem, campaign.resolved.plant()
+    states, m = np.tile(problem._start_or_zero, (problem.steps + 1, 1)), len(problem.control_coordinates)
+    standing = Trajectory(states, np.zeros((problem.steps, m)), problem.dt)
+
+    def may_draw(disturbance: Disturbance) -> bool:
+        """Whether trials may draw numbers for it: lqrsim's own do so as they start, others perhaps during a run."""
+        generator = np.random.default_rng(campaign.seed)
+        untouched = generator.bit_generator.state
+        try:
+            disturbance.check(plant)
+            disturbance.start(plant, standing, [generator])
+        except InputError:
+            raise
+        except Exception:  # it may depend on the trial or the plan, and then counts as an error of those trials
+            _log.debug("%s cannot be started beforehand", disturbance, exc_info=True)
+            return True
+        return not _is_packaged(type(disturbance)) or generator.bit_generator.state != untouched
+
     deterministic = list[list[Any]]()
     for sweep, strength in itertools.product(campaign.sweeps, campaign.strengths):
-        scaled = [disturbance.scaled(strength) for disturbance in campaign.sweeps[sweep]]
         try:
-            drawn = [_may_draw(campaign, disturbance) for disturbance in scaled]
+            drawn = [may_draw(disturbance.scaled(strength)) for disturbance in campaign.sweeps[sweep]]
         except InputError as error:
             raise InputError(f"sweeps: {sweep} at strength {strength:g}: {error}") from None
         deterministic += [] if any(drawn) else [[sweep, strength]]
     return deterministic
-
-
-def _may_draw(campaign: Campaign, disturbance: Disturbance) -> bool:
-    """Whether trials may draw numbers for a disturbance: lqrsim's own do so as they start, others perhaps during a run.
-
-    Raises InputError if the disturbance does not fit the robot.
-    """
-    problem, plant = campaign.resolved.problem, campaign.resolved.plant()
-    states, m = np.tile(problem._start_or_zero, (problem.steps + 1, 1)), len(problem.control_coordinates)
-    standing = Trajectory(states, np.zeros((problem.steps, m)), problem.dt)
-    generator = np.random.default_rng(campaign.seed)
-    untouched = generator.bit_generator.state
-    try:
-        disturbance.check(plant)
-        disturbance.start(plant, standing, [generator])
-    except InputError:
-        raise
-    except Exception:  # it may depend on the trial or the plan, and then counts as an error of those trials
-        _log.debug("%s cannot be started beforehand", disturbance, exc_info=True)
-        return True
-    return not _is_packaged(type(disturbance)) or generator.bit_generator.state != untouched
 
 
 def _is_packaged(kind: type[Disturbance]) -> bool:
@@ -393,26 +392,24 @@ def _unfinished(results: Results) -> list[Shard]:
     """The shards that are still to be run. Removes half-written files, and moves damaged ones aside."""
     for remains in results.folder.glob("**/.unfinished-*"):
         remains.unlink(missing_ok=True)
-    on_disk = results.shards_on_disk()
-    return [shard for shard in results.shards() if shard not in on_disk or not _is_intact(results, shard)]
-
-
-def _is_intact(results: Results, shard: Shard) -> bool:
-    """Whether a shard's file is as it was written; if it is not, it is moved aside."""
-    path = results.path(shard)
-    try:
-        read_table(path, shard, results.manifest.digest)
-    except Damaged as error:
-        folder = results.folder / "damaged"
+    on_disk, unfinished = results.shards_on_disk(), list[Shard]()
+    for shard in results.shards():
+        path = results.path(shard)
         try:
-            folder.mkdir(exist_ok=True)
-            aside = path.replace(folder / free_name(path.name, os.listdir(folder)))
-        except OSError as problem:
-            got = f"{path}, which is damaged and cannot be moved ({problem.strerror})"
-            raise InputError(f"shard: got {got}, want it removed") from None
-        _log.warning("%s was damaged (%s); moved it to %s, its trials run again", path.name, error, aside)
-        return False
-    return True
+            if shard in on_disk:
+                read_table(path, shard, results.manifest.digest)
+                continue
+        except Damaged as error:
+            folder = results.folder / "damaged"
+            try:
+                folder.mkdir(exist_ok=True)
+                aside = path.replace(folder / free_name(path.name, os.listdir(folder)))
+            except OSError as problem:
+                got = f"{path}, which is damaged and cannot be moved ({problem.strerror})"
+                raise InputError(f"shard: got {got}, want it removed") from None
+            _log.warning("%s was damaged (%s); moved it to %s, its trials run again", path.name, error, aside)
+        unfinished.append(shard)
+    return unfinished
 
 
 @dataclass(frozen=True, eq=False)
@@ -424,13 +421,6 @@ class Job:
     batch: int
     # Differs in every run, even of the same campaign.
     name: str = field(default_factory=lambda: f"lqrsim-{uuid.uuid4().hex}")
-
-    @classmethod
-    def of(cls, results: Results, batch: int) -> "Job":
-        """The job of running a campaign's trials elsewhere. Its solutions lack the logs of their solves."""
-        unused: dict[str, Any] = {"inverse_policy": None, "cost_to_come": None, "iterations": (), "candidates": ()}
-        solutions = {policy: replace(solution, **unused) for policy, solution in results.runner.solutions.items()}
-        return cls(results.manifest, solutions, batch)
 
     def prepare(self, *, here: bool = False) -> TrialRunner:
         """The runner of this job's trials, kept in this process until there is another job.

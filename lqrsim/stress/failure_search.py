@@ -178,7 +178,6 @@ class TrialScore:
     contacts: bool = False
     batch: Count = 256
     threads: int | None = None
-    simulations: Index = 0
 
     def __post_init__(self) -> None:
         draws = [PrescribedDraws(ZEROS) for _ in self.disturbances]  # counts how many each draws
@@ -211,7 +210,6 @@ class TrialScore:
             scores.append(shaped("failure: returned", returned, (len(part),)))
             if np.isnan(scores[-1]).any():
                 raise InputError(f"failure: returned {excerpt(scores[-1].tolist())}, want numbers: positive is failure")
-        self.simulations += len(vectors)
         return np.concatenate(scores)
 
     def rollout(self, numbers: npt.ArrayLike, *, frames: bool = True) -> Rollout:
@@ -328,24 +326,18 @@ class ReliabilityProblem(Study):
           KeyboardInterrupt: Ctrl-C; its `found` is the SmallestFailure after the rounds that are done, or None.
         """
         seed = self.seed if seed is None else seed
+        options: dict[str, Any] = {"seed": seed, "rounds": rounds, "particles": particles}
         score, level = self.score, self._begin(report)
-        before = score.simulations
         if score(np.zeros((1, score.size)))[0] > 0:
             got = f"{self.policy}, which fails with all random numbers at zero"
             raise InputError(f"policy: got {got}, want one that succeeds when undisturbed")
 
-        def result(point: reliability.DesignPoint) -> SmallestFailure:
-            options = {"seed": seed, "rounds": rounds, "particles": particles}
-            return SmallestFailure(self, point, score.simulations - before, options)
+        def result(point: object) -> SmallestFailure | None:
+            return SmallestFailure(self, point, options) if isinstance(point, reliability.DesignPoint) else None
 
-        with keeping(lambda done: result(done) if isinstance(done, reliability.DesignPoint) else None):
-            failures = reliability.failure_probability(
-                score, score.size, particles=particles, keep=0.2, repetitions=2, level=level, seed=seed
-            ).failures
-            point = reliability.smallest_failure(
-                score, score.size, failures=failures, rounds=rounds, progress=progress, seed=seed
-            )
-        return result(point)
+        with keeping(result):
+            point = reliability.smallest_failure(score, score.size, level=level, progress=progress, **options)
+        return SmallestFailure(self, point, options)
 
     def _begin(self, report: Report | None) -> Callable[[float], object] | None:
         """Report the summary. Returns a function that reports a level of the score with its unit."""
@@ -548,8 +540,12 @@ class SmallestFailure:
 
     problem: ReliabilityProblem
     point: reliability.DesignPoint
-    simulations: int  # number of trials, including the splitting before the search
     options: Mapping[str, int]  # `seed`, `rounds` and `particles`
+
+    @property
+    def simulations(self) -> int:
+        """Number of trials, with the splitting before the search and the undisturbed trial before both."""
+        return self.point.simulations + 1
 
     @property
     def shares(self) -> tuple[float, ...]:

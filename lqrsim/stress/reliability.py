@@ -39,7 +39,7 @@ The result is a failure. There may be a nearer failure; a search from other fail
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.special import ndtr
@@ -334,15 +334,18 @@ def smallest_failure(
     size: Count,
     *,
     failures: Array | None = None,
+    particles: Annotated[int, Bounds(at_least=10)] = 200,
     rounds: Rounds = 40,
     pairs: Annotated[int, Bounds(at_least=2)] | None = None,
     seed: Seed = 0,
+    level: OnLevel | None = None,
     progress: TextProgress | None = None,
 ) -> DesignPoint:
     """Search for the failure that is nearest to the origin.
 
     Args:
-      failures: (k, size), failures to begin with; by default the failures of a small splitting.
+      failures: (k, size), failures to begin with; by default those of a small splitting: see `failure_probability` for
+        its `particles` and `level`.
       rounds: largest number of rounds. The search ends earlier if the noise permits a gain of less than 1 % of the
         distance, and five rounds together gain less than a tenth of that.
       pairs: pairs in each round; by default half the size, at least 250. With fewer the gradient is mostly noise.
@@ -356,7 +359,8 @@ def smallest_failure(
     rng, counted = np.random.default_rng(seed), CountedScore(score)
     tell = progress or (lambda done, total, text: None)
     if failures is None:
-        failures = failure_probability(counted, size, particles=200, keep=0.2, repetitions=2, seed=seed).failures
+        options: dict[str, Any] = {"particles": particles, "keep": 0.2, "repetitions": 2, "seed": seed}
+        failures = failure_probability(counted, size, level=level, **options).failures
     failures = check_array("failures", failures, (None, size))
     best = _nearest_of(counted, failures)
     history = [float(np.linalg.norm(best))]
