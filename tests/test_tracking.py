@@ -374,10 +374,16 @@ def turning(x: Any, u: Any, p: Any) -> list[Any]:
     return [u.v * cos(p.unit * x.heading), u.v * sin(p.unit * x.heading), u.turn / p.unit]
 
 
-@hypothesis.given(st.integers(0, 10**6), st.floats(-4, 4))
+@pytest.mark.parametrize("place", [{"position": ("x", "y"), "plane": "xy"}, {}])
+@hypothesis.given(seed=st.integers(0, 10**6), exponent=st.floats(-4, 4))
 @hypothesis.settings(max_examples=examples(12))
-def test_what_is_chosen_depends_on_no_unit_of_what_is_no_position(seed: int, exponent: float) -> None:
-    """A heading in degrees had made the laws looser: a thousandth of the largest number counted as narrow enough."""
+def test_what_is_chosen_depends_on_no_unit_of_what_is_no_position(
+    place: dict[str, Any], seed: int, exponent: float
+) -> None:
+    """A heading in degrees had made the laws looser: a thousandth of the largest number counted as narrow enough.
+
+    Without a position, a heading in units of many turns had hardly counted: no range was less than one unit.
+    """
     rng, unit = np.random.default_rng(seed), 10.0**exponent
     start = rng.uniform(-1, 1, 3)
     controls = np.stack([rng.uniform(0.3, 1.0, 30), rng.normal(size=30)], axis=1)
@@ -385,7 +391,7 @@ def test_what_is_chosen_depends_on_no_unit_of_what_is_no_position(seed: int, exp
     for size in (1.0, unit):
         dynamics = ls.Dynamics(
             turning, states={"x": "m", "y": "m", "heading": "deg"}, controls={"v": "m/s", "turn": "rad/s"},
-            parameters={"unit": size}, control_limits=((-9, -9), (9, 9)), position=("x", "y"), plane="xy",
+            parameters={"unit": size}, control_limits=((-9, -9), (9, 9)), **place,
         )  # fmt: skip
         states: list[Array] = [start / (1.0, 1.0, size)]
         for control in controls:

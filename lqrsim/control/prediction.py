@@ -35,7 +35,6 @@ from lqrsim.kernels.records import LoopArrays, LoopMoments, LoopSizes, LoopWork,
 from lqrsim.problem.collision_shape import ShapeInWorld
 from lqrsim.problem.obstacles import Clearance, KeepsClear, each_once
 from lqrsim.problem.problem import Problem
-from lqrsim.results.goal import scale_of
 from lqrsim.results.solution import Solution
 
 LARGEST_MARGIN = 12.0  # standard deviations of clearance; with more the chance of a collision is below 1e-32
@@ -287,14 +286,14 @@ class DeviationNorm(NamedTuple):
     """The norm of deviations from a plan: of the position in m, or without one of the goal's states, each scaled."""
 
     states: list[int]  # indices of the states that count
-    scale: Array  # (C,) what each is divided by: 1, or its range over the plan
+    scale: Array  # (C,) what each is divided by: 1, or `Target.scale`, which has no unit of its own
 
     @classmethod
     def of(cls, solution: Solution, position: Sequence[int]) -> Self:
         if position:
             return cls(list(position), np.ones(len(position)))
         counts = np.flatnonzero(np.isfinite(solution.target.state)).tolist()
-        return cls(counts, scale_of(solution.trajectory.states)[counts])
+        return cls(counts, solution.target.scale[counts])
 
     def __call__(self, off: Array) -> Array:
         """The norms (...) of deviations (..., n)."""
