@@ -32,6 +32,7 @@ from lqrsim.control.controllers import Controller, ControllerRun, Feedback
 from lqrsim.errors import Array, InputError
 from lqrsim.scenarios.references import resolve
 from lqrsim.simulation.disturbances import ControlNoise, ForceNoise
+from lqrsim.stress.analysis import outcomes
 from lqrsim.stress.campaign import Job, _code, _sole_writer, run_campaign, run_on_cluster
 from lqrsim.stress.results import Columns, Damaged, Results, differences, replay, unpack
 from lqrsim.stress.study import Campaign, Cell, Shard, TrialRunner
@@ -914,6 +915,21 @@ def test_a_trial_again_is_the_same_until_it_collides(reference: Results) -> None
             )
             assert differences(reference, cell, trial, free) == differences(reference, cell, trial, solid) == []
             np.testing.assert_array_equal(free.states[free.counts], solid.states[solid.counts])
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_trial_that_hits_another_obstacle_differs(reference: Results, seed: int) -> None:
+    """Also one whose name begins as that of the other does."""
+    draws, cell = random.Random(seed), reference.cells[0]
+    names = ["".join(draws.choices("ab", k=draws.randint(1, 4))) for _ in range(2)]
+    run = replay(reference, cell, 0, frames=False)
+    was, now = (replace(run, collided_at=np.array([1.0]), obstacles=(name,)) for name in names)
+    row = outcomes(was, reference.runner.scenario.problem).columns()
+    results: Any = SimpleNamespace(
+        shards=lambda cell: [Shard(0, 0, 1)], table=lambda shard: row, runner=reference.runner
+    )
+    said = [f"obstacle: {names[1]} (in the table: {names[0]})"] if names[1] != names[0] else []
+    assert differences(results, cell, 0, now) == said
 
 
 def test_a_file_does_not_choose_what_code_runs(own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

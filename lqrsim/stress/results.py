@@ -365,7 +365,7 @@ def differences(results: Results, cell: Cell, trial: int, again: Rollout) -> lis
     return [
         f"{name}: {value[0]} (in the table: {was[name]})"
         for name, value in now.items()
-        if value.astype(np.asarray(was[name]).dtype)[0].tobytes() != np.asarray(was[name]).tobytes()
+        if value[0].tobytes() != was[name].tobytes()
     ]
 
 
