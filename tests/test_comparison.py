@@ -42,7 +42,7 @@ def campaigns(
 def stated(results: ls.stress.Results, **changed: Any) -> ls.stress.Results:
     """The same as if its manifest said something else: what cannot be compared is refused before trials are read."""
     other = ls.stress.Results(results.folder)
-    other.manifest = dataclasses.replace(other.manifest, campaign=other.manifest.campaign | changed)
+    other.manifest = dataclasses.replace(other.manifest, campaign={**other.manifest.campaign, **changed})
     return other
 
 

@@ -394,8 +394,8 @@ def compare(
       with low and high; p, adjusted for the number of rows (Holm, 1979). With different seeds, first trials and second
       trials take the place of trials, only first and only second. Failure rates differ by as much, the other way round.
     """
-    given = [first] if second is None else [first, second]
-    opened = [campaign if isinstance(campaign, Results) else Results(campaign) for campaign in given]
+    campaigns = [first] if second is None else [first, second]
+    opened = [campaign if isinstance(campaign, Results) else Results(campaign) for campaign in campaigns]
     results, chosen = (opened[0], opened[-1]), policies or ()
     manifests = [campaign.manifest for campaign in results]
     settings = [manifest.settings for manifest in manifests]
