@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from mechanisms import NO_CONTACT, arm, motors, sled
+from mechanisms import NO_CONTACT, arm, motors, row, scene, sled
 from sampling import examples, rarely
 from scipy.spatial.transform import Rotation
 
@@ -315,13 +315,11 @@ def test_what_holds_an_arm_still_by_inverse_dynamics(kind: str, seed: int) -> No
     """The acceleration by MuJoCo is zero there; and where a limit is too tight, the joint that is short is told of."""
     rng = np.random.default_rng(seed)
     given = {"motor": 'gear="3"', "position": 'kp="80" kv="2"', "general": 'gainprm="5" gear="-2"'}[kind]
-    links = "".join(
-        f'<body pos="{rng.uniform(0.1, 0.3)} 0 0"><joint name="j{i}" axis="{i % 2} 1 0" armature="0.01"/>'
-        f'<geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.03" contype="0" conaffinity="0"/>'
-        for i in range(3)
-    )
-    tight = f"""<mujoco><compiler autolimits="true"/><worldbody><body>{links}</body></body></body></body></worldbody>
-      <actuator>{"".join(f'<{kind} name="a{i}" joint="j{i}" {given}/>' for i in range(3))}</actuator></mujoco>"""
+    driven = "".join(f'<{kind} name="a{i}" joint="j{i}" {given}/>' for i in range(3))
+    tight = arm(
+        *rng.uniform(0.1, 0.3, 3), names=("j0", "j1", "j2"), joint='armature="0.01"',
+        joints=('axis="0 1 0"', 'axis="1 1 0"', 'axis="0 1 0"'), actuators=driven, option="",
+    )  # fmt: skip
     robot = ls.MjcfRobot(scene_from_xml(tight, "arm"))
     state = robot.at(None, **{f"j{i}": float(rng.uniform(-1, 1)) for i in range(3)})
     data = mujoco.MjData(robot.scene.model)
@@ -356,15 +354,10 @@ def test_what_holds_an_arm_still_by_inverse_dynamics(kind: str, seed: int) -> No
 def test_actuators_with_states_hold_what_they_are_said_to(kind: str, seed: int) -> None:
     """Two links in gravity, by plain `mj_step` for half a second from the state that `at` and `at_rest` return."""
     rng = np.random.default_rng(seed)
-    bodies = (
-        f'<body pos="{{}} 0 0"><joint name="{name}" axis="0 1 0" damping="0.5" armature="0.05"/>'
-        '<geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.03" contype="0" conaffinity="0"/>'
-        for name in ("upper", "fore")
-    )
-    xml = f"""<mujoco><option integrator="implicitfast"/><compiler autolimits="true"/>
-      <worldbody>{"".join(bodies).format(0, rng.uniform(0.2, 0.3))}</body></body></worldbody>
-      <actuator>{kind.format('name="first" joint="upper"')}{kind.format('name="second" joint="fore"')}</actuator>
-      </mujoco>"""
+    xml = arm(
+        rng.uniform(0.2, 0.3), 0.2, names=("upper", "fore"), option='integrator="implicitfast"',
+        actuators=kind.format('name="first" joint="upper"') + kind.format('name="second" joint="fore"'),
+    )  # fmt: skip
     robot = ls.MjcfRobot(scene_from_xml(xml, "arm"))
     model, angles = robot.scene.model, dict(zip(("upper", "fore"), rng.uniform(-1, 1, 2), strict=True))
     state = robot.at(None, **angles)
@@ -405,8 +398,8 @@ def test_the_robot_is_its_base_where_the_mass_is_in_what_is_fixed_to_it(seed: in
     inner = f'<geom size="0.1" mass="2"/>{wheels}'
     for depth in range(nested):
         inner = f'<body name="part{depth}" pos="{rng.uniform(-0.3, 0.3)} 0 0">{inner}</body>'
-    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><worldbody><body name="base"><freejoint name="root"/>{inner}</body>
-      </worldbody><actuator><motor joint="wheel0"/></actuator></mujoco>""", "car"))  # fmt: skip
+    xml = scene(f'<body name="base"><freejoint name="root"/>{inner}</body>', '<motor joint="wheel0"/>')
+    robot = ls.MjcfRobot(scene_from_xml(xml, "car"))
     space = robot.dynamics.state_coordinates
     assert robot.body == "base"
     assert [space.names[i] for i in space.position] == ["root_x", "root_y", "root_z"]
@@ -432,14 +425,8 @@ def test_a_position_is_the_place_in_the_world_or_there_is_none(seed: int) -> Non
     for axis, up in zip(axes, made_up, strict=True):
         along, ref = " ".join("1" if i == axis else "0" for i in range(3)), f"ref='{place[axis]}'" if up else ""
         joints += f"<joint name='p{'xyz'[axis]}' type='slide' axis='{along}' {ref}/>"
-    robot = ls.MjcfRobot(
-        scene_from_xml(
-            f"<mujoco><worldbody><body name='base' pos='{' '.join(map(str, place))}'>{joints}"
-            "<geom type='sphere' size='0.1' mass='1'/></body></worldbody>"
-            f"<actuator><motor joint='p{'xyz'[axes[0]]}'/></actuator></mujoco>",
-            "gantry",
-        )
-    )
+    body = f"<body name='base' pos='{' '.join(map(str, place))}'>{joints}<geom size='0.1' mass='1'/></body>"
+    robot = ls.MjcfRobot(scene_from_xml(scene(body, f"<motor joint='p{'xyz'[axes[0]]}'/>"), "gantry"))
     missing = [axis for axis, up in zip(axes, made_up, strict=True) if place[axis] != 0 and not up]
     position = robot.dynamics.state_coordinates.position
     if missing:
@@ -487,15 +474,10 @@ def rov_among(others: str, *, hull: str = "ellipsoid") -> ls.MjcfRobot:
         f'<motor site="{i}" gear="0 0 1 0 0 0" ctrlrange="-35 35"/>'
         for i, (x, y) in enumerate(places)
     )
-    return ls.MjcfRobot(
-        scene_from_xml(
-            f"""<mujoco><option timestep="0.02" integrator="implicitfast" density="1000" viscosity="0.001"/><worldbody>
-            <body name="rov" pos="0 0 1" gravcomp="1"><freejoint name="rov"/><geom type="{hull}" mass="11.5"
-            size="0.25 0.18 0.13"/>{sites}</body>{others}</worldbody><actuator>{thrusters}</actuator></mujoco>""",
-            "rov",
-        ),
-        body="rov",
-    )
+    bodies = f"""<body name="rov" pos="0 0 1" gravcomp="1"><freejoint name="rov"/>
+      <geom type="{hull}" mass="11.5" size="0.25 0.18 0.13"/>{sites}</body>{others}"""
+    water = 'timestep="0.02" integrator="implicitfast" density="1000" viscosity="0.001"'
+    return ls.MjcfRobot(scene_from_xml(scene(bodies, thrusters, option=water), "rov"), body="rov")
 
 
 @pytest.mark.parametrize("clearance", rarely(0.2, None))
@@ -556,14 +538,11 @@ def test_a_plan_along_which_flat_sides_lie_along_pillars_ends() -> None:
 def test_a_plan_that_comes_near_a_whole_turn_says_so(turn: float) -> None:
     """There a tilt of 0.02 rad is at least 0.3 rad of the rotation vector: |r| / (2 sin(|r| / 2)) times as much."""
     motors = "".join(f'<motor joint="b" gear="{gear}"/>' for gear in ("1 0 0", "0 1 0", "0 0 1"))
-    robot = ls.MjcfRobot(
-        scene_from_xml(
-            f"""<mujoco><option timestep="0.02" gravity="0 0 0" integrator="implicitfast"/><worldbody><body>
-            <joint name="b" type="ball" damping="0.1"/><geom type="box" size="0.1 0.1 0.1" mass="5"/></body></worldbody>
-            <actuator>{motors}</actuator></mujoco>""",
-            "ball",
-        )
-    )
+    xml = row(
+        "b", joint='type="ball" damping="0.1"', geom='type="box" size="0.1 0.1 0.1" mass="5"',
+        actuators=motors, option='timestep="0.02" gravity="0 0 0" integrator="implicitfast"',
+    )  # fmt: skip
+    robot = ls.MjcfRobot(scene_from_xml(xml, "ball"))
     goal = robot.at(b_rx=0.6 * turn, b_rz=0.8 * turn)
     solution = ls.smooth(robot.problem(robot.at(), goal, steps=50, dt=0.04, weights=1e4))
     assert solution.status is ls.Status.CONVERGED
@@ -670,14 +649,13 @@ def test_a_robot_above_its_support_is_let_down(seed: int) -> None:
         for name, x in (("fore", rng.uniform(0.1, 0.2)), ("hind", -rng.uniform(0.1, 0.2)))
     )
     top = rng.uniform(-0.2, 0.3)
-    scene = scene_from_xml(
-        f"""<mujoco><option integrator="implicitfast"/><worldbody>
-      <geom name="table" type="box" size="2 2 .01" pos="0 0 {top - 0.01}"/>
-      <body name="trunk" pos="0 0 1"><freejoint/><geom type="box" size=".2 .1 .05" mass="2"/>{feet}</body></worldbody>
-      <actuator><position joint="fore" kp="80"/><position joint="hind" kp="80"/></actuator></mujoco>""",
-        "stand",
-    )
-    robot = ls.MjcfRobot(scene, obstacles=False)
+    xml = sled(
+        "", place="0 0 1", geom='type="box" size=".2 .1 .05" mass="2"', carried=f"<freejoint/>{feet}",
+        things=f'<geom name="table" type="box" size="2 2 .01" pos="0 0 {top - 0.01}"/>',
+        actuators='<position joint="fore" kp="80"/><position joint="hind" kp="80"/>',
+        option='integrator="implicitfast"',
+    )  # fmt: skip
+    robot = ls.MjcfRobot(scene_from_xml(xml, "stand"), obstacles=False)
     state = robot.at_rest(robot.at(z=top + rng.uniform(0.33, 0.8), rz=rng.uniform(-3, 3)))
     model = robot.scene.model
     data = mujoco.MjData(model)
@@ -689,7 +667,7 @@ def test_a_robot_above_its_support_is_let_down(seed: int) -> None:
     with pytest.raises(InputError, match="touches its support, or is above it"):
         robot.at_rest(robot.at(z=top - 2))
     with pytest.raises(InputError, match="obstacles such as table carry nothing: obstacles= chooses others"):
-        ls.MjcfRobot(scene).at_rest(robot.at(z=top + 1))
+        ls.MjcfRobot(scene_from_xml(xml, "stand")).at_rest(robot.at(z=top + 1))
 
 
 @settings(max_examples=examples(8))
@@ -706,10 +684,12 @@ def test_muscles_hold_by_pulling_at_most_as_much_as_they_can(seed: int) -> None:
              for one, z in (("top", 0.3), ("limb", -0.1))}  # fmt: skip
     muscles = "".join(f'<muscle name="{k}" tendon="{k}" lengthrange="0.3 0.5" force="40" {limited}/>' for k in places)
     tendons = "".join(f'<spatial name="{k}"><site site="top{k}"/><site site="limb{k}"/></spatial>' for k in places)
-    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
-      {sites["top"]}<body name="limb"><joint name="hinge" axis="0 1 0" damping="0.5"/>
-      <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.5"/>{sites["limb"]}</body></worldbody>
-      <tendon>{tendons}</tendon><actuator>{muscles}</actuator></mujoco>""", "limb"))  # fmt: skip
+    xml = arm(
+        0.3, along=(0, 0, -1), names=["hinge"], joint='axis="0 1 0" damping="0.5"', geom='size="0.02" mass="0.5"',
+        end=sites["limb"], things=sites["top"], more=f"<tendon>{tendons}</tendon>", actuators=muscles,
+        option='timestep="0.002" integrator="implicitfast"',
+    )  # fmt: skip
+    robot = ls.MjcfRobot(scene_from_xml(xml, "limb"))
     space = robot.dynamics.control_coordinates
     state = robot.at(hinge=rng.uniform(-0.2, 0.2))
     control, data = robot.hold(state), mujoco.MjData(robot.scene.model)
@@ -729,10 +709,11 @@ def test_cables_that_only_pull_hold_a_platform_with_winches_that_lag() -> None:
     cables = "".join(f'<spatial name="{name}"><site site="{name}"/><site site="hook"/></spatial>' for name in sites)
     lag = 'gear="-1" dyntype="filter" dynprm="0.05" ctrlrange="2 90"'
     winches = "".join(f'<general tendon="{name}" {lag}/>' for name in sites)
-    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><compiler autolimits="true"/><worldbody>{places}
-      <body name="mass" pos="0 0 1.5"><joint name="x" type="slide"/><joint name="z" type="slide" axis="0 0 1"/>
-      <geom size="0.1" mass="3" contype="0" conaffinity="0"/><site name="hook"/></body></worldbody>
-      <tendon>{cables}</tendon><actuator>{winches}</actuator></mujoco>""", "cables"))  # fmt: skip
+    xml = sled(
+        "xz", place="0 0 1.5", geom=f'size="0.1" mass="3" {NO_CONTACT}', carried='<site name="hook"/>', things=places,
+        more=f"<tendon>{cables}</tendon>", actuators=winches, option="",
+    )  # fmt: skip
+    robot = ls.MjcfRobot(scene_from_xml(xml, "cables"))
     state = robot.at(x=-0.7, z=-0.4)
     held, data = robot.hold(state), mujoco.MjData(robot.scene.model)
     assert (held >= 2).all()
@@ -749,14 +730,12 @@ def test_fingers_that_are_coupled_follow_and_are_held(seed: int) -> None:
     """Two fingers that one motor moves; against gravity and each other's weight, by MuJoCo's own steps."""
     rng = np.random.default_rng(seed)
     offset, ratio = rng.uniform(-0.02, 0.02), rng.choice([-1.0, 1.0, 0.5])
-    fingers = "".join(
-        f'<body pos="0 {side} 0"><joint name="{name}" type="slide" axis="0 0 1" damping="5"/>'
-        f'<geom size="0.02" mass="{mass}" contype="0" conaffinity="0"/></body>'
-        for name, side, mass in (("left", 0.1, 0.2), ("right", -0.1, 0.3))
-    )
-    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><worldbody>{fingers}</worldbody>
-      <equality><joint joint1="right" joint2="left" polycoef="{offset} {ratio}" solref="0.005 1"/></equality>
-      <actuator><motor name="grip" joint="left"/></actuator></mujoco>""", "gripper"), position=())  # fmt: skip
+    tie = f'<joint joint1="right" joint2="left" polycoef="{offset} {ratio}" solref="0.005 1"/>'
+    xml = row(
+        ("left", "right"), joint='type="slide" axis="0 0 1" damping="5"', geoms=('mass="0.2"', 'mass="0.3"'),
+        more=f"<equality>{tie}</equality>", actuators='<motor name="grip" joint="left"/>',
+    )  # fmt: skip
+    robot = ls.MjcfRobot(scene_from_xml(xml, "gripper"), position=())
     state = robot.at(left=0.05)
     np.testing.assert_allclose(state, [0.05, offset + ratio * 0.05, 0, 0], rtol=1e-12)
     np.testing.assert_allclose(robot.hold(state), 9.81 * (0.2 + ratio * 0.3), rtol=1e-6)
@@ -778,9 +757,10 @@ def test_an_integrator_whose_control_is_never_zero_rests_at_the_end_of_its_range
     low, high = np.sort(rng.uniform(0.1, 2.0, 2)) if above else -np.sort(-rng.uniform(-2.0, -0.1, 2))[::-1]
     end, gain = rng.uniform(0.2, 0.8), rng.uniform(20, 60)
     servo = INTEGRATING.format(gain=gain) + f' biasprm="0 -{gain} -2" ctrlrange="{low} {high}" '
-    xml = f"""<mujoco><option integrator="implicitfast"/><compiler autolimits="true"/><worldbody><body>
-      <joint name="hinge" axis="0 1 0" damping="0.5"/><geom size="0.05" pos="0 0 -0.3" mass="0.5"/></body></worldbody>
-      <actuator>{servo} {{}}/></actuator></mujoco>"""
+    xml = row(
+        ["hinge"], joint='axis="0 1 0" damping="0.5"', geom='size="0.05" pos="0 0 -0.3" mass="0.5"',
+        actuators=f"{servo} {{}}/>", option='integrator="implicitfast"',
+    )  # fmt: skip
     drifting = ls.MjcfRobot(scene_from_xml(xml.format(""), "drift"))
     state, model = drifting.at(hinge=0.3), drifting.scene.model
     (control,) = drifting.hold(state)
@@ -821,9 +801,8 @@ def five_bar(rng: np.random.Generator, tie: str = "connect") -> str:
         "connect": f'<connect name="tie" body1="left_link" body2="right_link" anchor="{apart} 0 {rise}"/>',
         "sites": '<connect name="tie" site1="left_tip" site2="right_tip"/>',
     }
-    return f"""<mujoco><option integrator="implicitfast"/><worldbody>{arms}</worldbody><equality>{ties[tie]}</equality>
-      <actuator><motor name="m1" joint="left" ctrlrange="-3 3"/><motor name="m2" joint="right" ctrlrange="-3 3"/>
-      </actuator><compiler autolimits="true"/></mujoco>"""
+    driven, tied = motors(("left", "right"), (3, 3)), f"<equality>{ties[tie]}</equality>"
+    return scene(arms, driven, more=tied, option='integrator="implicitfast"')
 
 
 @pytest.mark.parametrize("tie", ["connect", "sites"])
@@ -879,9 +858,8 @@ def test_welds_and_tendons_hold_joints_together(seed: int) -> None:
         f'<joint name="{s}3" axis="0 1 0"/><geom size="0.05" {NO_CONTACT}/></body></body></body>'
         for s, x in (("l", -0.1), ("r", 0.1))
     )
-    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><worldbody>{arms}</worldbody>
-      <equality><weld body1="l" body2="r"/></equality><actuator><motor joint="l1"/><motor joint="r1"/>
-      <motor joint="l3"/></actuator></mujoco>""", "arms"))  # fmt: skip
+    xml = scene(arms, motors(("l1", "r1", "l3")), more='<equality><weld body1="l" body2="r"/></equality>')
+    robot = ls.MjcfRobot(scene_from_xml(xml, "arms"))
     state, data = robot.at(l1=rng.uniform(-0.3, 0.3), r1=rng.uniform(-0.3, 0.3)), mujoco.MjData(robot.scene.model)
     data.qpos[:] = robot.configuration(state)[0]
     mujoco.mj_forward(robot.scene.model, data)
@@ -889,16 +867,13 @@ def test_welds_and_tendons_hold_joints_together(seed: int) -> None:
         np.testing.assert_allclose(side.xpos, data.body("l").xpos, rtol=0, atol=1e-9)
         np.testing.assert_allclose(side.xmat, data.body("l").xmat, rtol=0, atol=1e-9)
     assert "falls short" not in str(robot)
-    bodies = "".join(
-        f'<body pos="0 {k} 0"><joint name="{name}" axis="0 1 0" damping="1"/>'
-        f'<geom size="0.05" pos="{rng.uniform(0.1, 0.3)} 0 0" mass="0.2" {NO_CONTACT}/></body>'
-        for k, name in enumerate("ab")
-    )
-    ratio = rng.uniform(0.5, 2.0)
-    fingers = ls.MjcfRobot(scene_from_xml(f"""<mujoco><worldbody>{bodies}</worldbody><tendon><fixed name="t">
-      <joint joint="a" coef="1"/><joint joint="b" coef="{ratio}"/></fixed></tendon>
-      <equality><tendon tendon1="t"/></equality><actuator><motor joint="a"/></actuator></mujoco>""",
-      "fingers"))  # fmt: skip
+    geoms, ratio = [f'pos="{far} 0 0"' for far in rng.uniform(0.1, 0.3, 2)], rng.uniform(0.5, 2.0)
+    tendon = f'<fixed name="t"><joint joint="a" coef="1"/><joint joint="b" coef="{ratio}"/></fixed>'
+    xml = row(
+        "ab", joint='axis="0 1 0" damping="1"', geom=f'size="0.05" mass="0.2" {NO_CONTACT}', geoms=geoms,
+        more=f'<tendon>{tendon}</tendon><equality><tendon tendon1="t"/></equality>', actuators='<motor joint="a"/>',
+    )  # fmt: skip
+    fingers = ls.MjcfRobot(scene_from_xml(xml, "fingers"))
     state = fingers.at(a=0.4)
     assert state[1] == pytest.approx(-0.4 / ratio, abs=1e-9)
     after = fingers.dynamics.step(state, fingers.hold(state), 0.2)
@@ -909,13 +884,8 @@ def test_loops_that_can_not_close_and_couplings_that_bend() -> None:
     robot = ls.MjcfRobot(scene_from_xml(five_bar(np.random.default_rng(0)), "five-bar"))
     with pytest.raises(InputError, match=r"joints: got left -1.5, right 1.5, want positions at which all loops close"):
         robot.at(left=-1.5, right=1.5)
-    bodies = "".join(
-        f'<body pos="0 {k} 0"><joint name="{name}" axis="0 1 0"/><geom size="0.1"/></body>'
-        for k, name in enumerate("ab")
-    )
-    bent = ls.MjcfRobot(scene_from_xml(f"""<mujoco><worldbody>{bodies}</worldbody><equality>
-      <joint joint1="a" joint2="b" polycoef="0.1 1 2"/></equality><actuator><motor joint="a"/></actuator></mujoco>""",
-      "cam"))  # fmt: skip
+    cam = '<equality><joint joint1="a" joint2="b" polycoef="0.1 1 2"/></equality>'
+    bent = ls.MjcfRobot(scene_from_xml(row("ab", more=cam, actuators='<motor joint="a"/>'), "cam"))
     np.testing.assert_allclose(bent.at(b=0.3)[:2], [0.1 + 0.3 + 2 * 0.3**2, 0.3], rtol=0, atol=1e-9)
 
 
@@ -932,23 +902,22 @@ def tied(kind: str, rng: np.random.Generator) -> str:
         )
         ties = "".join(f'<connect body1="rod{i}" body2="plate" anchor="0 0 -0.3"/>' for i in range(2))
         moved = '<body><joint name="lever" axis="1 0 0"/><geom size="0.05"/></body>'
-        return f"""<mujoco><worldbody>{rods}{moved}<body name="plate" pos="0 0 -0.3"><freejoint/>
-          <geom type="box" size="0.3 0.05 0.01" {NO_CONTACT}/></body></worldbody><equality>{ties}</equality>
-          <actuator><motor joint="lever"/></actuator></mujoco>"""
-    bodies = "".join(
-        f'<body name="{name}" pos="0 0 {0.3 * k}"><joint name="{name}" axis="0 1 0"/><geom size="0.02" {NO_CONTACT}/>'
-        for k, name in enumerate("abc")
-    )
+        plate = (
+            f'<body name="plate" pos="0 0 -0.3"><freejoint/><geom type="box" size="0.3 0.05 0.01" {NO_CONTACT}/></body>'
+        )
+        return scene(rods + moved + plate, motors(["lever"]), more=f"<equality>{ties}</equality>")
     ratio = rng.uniform(0.5, 2.0)
     held = {
         "joint": f'<joint joint1="a" joint2="b" polycoef="0 {ratio} {rng.uniform(-1, 1)}"/><joint joint1="c"/>',
         "linear": f'<joint joint1="a" joint2="b" polycoef="0.1 {ratio}"/>',
-        "weld": '<weld body1="c"/>',
+        "weld": '<weld body1="hand"/>',
         "tendon": '<tendon tendon1="t"/>',
     }[kind]
     tendon = f'<fixed name="t"><joint joint="a" coef="1"/><joint joint="c" coef="{ratio}"/></fixed>'
-    return f"""<mujoco><worldbody>{bodies}</body></body></body></worldbody><tendon>{tendon}</tendon>
-      <equality>{held}</equality><actuator><motor joint="b"/></actuator></mujoco>"""
+    more = f"<tendon>{tendon}</tendon><equality>{held}</equality>"
+    return arm(
+        0.3, 0.3, 0.3, along=(0, 0, 1), joint='axis="0 1 0"', more=more, actuators='<motor joint="b"/>', option=""
+    )
 
 
 @pytest.mark.parametrize("kind", ["connect", "plate", "joint", "linear", "weld", "tendon"])
@@ -1018,9 +987,7 @@ def test_joint_limits_of_a_robot_without_any_are_refused_by_their_name(joints: s
     for number, kind in enumerate(joints.split()):
         nested += f'<body><joint name="j{number}" type="{kind}"/><geom size="0.1"/>'
     bodies = nested + "</body>" * len(joints.split())
-    actuator = '<actuator><motor joint="j0" gear="1 0 0 0 0 0"/></actuator>'
-    xml = f"<mujoco><worldbody>{bodies}</worldbody>{actuator}</mujoco>"
-    robot = ls.MjcfRobot(scene_from_xml(xml, "loose"))
+    robot = ls.MjcfRobot(scene_from_xml(scene(bodies, '<motor joint="j0" gear="1 0 0 0 0 0"/>'), "loose"))
     with pytest.raises(InputError, match=r"^MjcfRobot loose: joint_limits: got none, want problems without$"):
         _ = robot.joint_limits
 
@@ -1036,15 +1003,13 @@ def test_what_stands_on_its_feet_stays_there(seed: int) -> None:
         f'<geom size="0.03" pos="0 0 -0.3" mass="0.1"/></body>'
         for i, (x, y) in enumerate([(0.25, 0.2), (0.25, -0.2), (-0.25, 0.2), (-0.25, -0.2)])
     )
-    robot = ls.MjcfRobot(
-        scene_from_xml(
-            f"""<mujoco><worldbody><geom type="plane" size="1 1 1"/>
-      <body name="table" pos="0 0 0.33"><freejoint name="base"/><geom type="box" size="0.3 0.25 0.02" mass="1"/>
-      <geom size="0.01" pos="{aside} 0.05 0.05" mass="{mass}"/>{legs}</body></worldbody>
-      <actuator>{"".join(f'<motor name="m{i}" joint="leg{i}"/>' for i in range(4))}</actuator></mujoco>""",
-            "table",
-        )
-    )
+    load = f'<geom size="0.01" pos="{aside} 0.05 0.05" mass="{mass}"/>'
+    xml = sled(
+        "", place="0 0 0.33", geom='type="box" size="0.3 0.25 0.02" mass="1"',
+        things='<geom type="plane" size="1 1 1"/>', carried=f'<freejoint name="base"/>{load}{legs}',
+        actuators=motors([f"leg{i}" for i in range(4)]), option="",
+    )  # fmt: skip
+    robot = ls.MjcfRobot(scene_from_xml(xml, "table"))
     bent = robot.at(None, base_z=0.03 + 0.3 * np.cos(bend) - 1e-4, **{f"leg{i}": bend for i in range(4)})
     state = robot.at_rest(bent)
     np.testing.assert_array_equal(state[6:10], bent[6:10])  # the legs keep their angles
@@ -1201,9 +1166,9 @@ def test_what_has_no_name_gets_one_in_all_sections_and_included_files(
         text = f"<mujocoinclude><worldbody>{section}</worldbody></mujocoinclude>"
         (folder / f"part_{number}.xml").write_text(text)
     includes = "".join(f'<include file="part_{number}.xml"/>' for number in range(3))
-    first = f'<worldbody>{sections[0]}<body><joint name="j"/><geom size="0.1"/></body></worldbody>'
-    actuators = '<actuator><motor joint="j"/></actuator>'
-    (folder / "whole.xml").write_text(f"<mujoco>{first}{includes}{actuators}{actuators}</mujoco>")
+    body, again = '<body><joint name="j"/><geom size="0.1"/></body>', '<actuator><motor joint="j"/></actuator>'
+    xml = scene(body, '<motor joint="j"/>', things=sections[0], more=includes + again)
+    (folder / "whole.xml").write_text(xml)
     robot, model = ls.MjcfRobot(folder / "whole.xml"), mujoco.MjModel.from_xml_path(str(folder / "whole.xml"))
     ours = robot.scene.model
     assert (ours.ngeom, ours.njnt, ours.nu) == (model.ngeom, model.njnt, model.nu)
@@ -1262,12 +1227,15 @@ def test_laws_that_track_and_estimate_take_it() -> None:
 
 
 BAD = {
-    "no actuators": ('<worldbody><body><joint/><geom size="0.1"/></body></worldbody>', "actuators: got none, want at"),
-    "nothing moves": ('<worldbody><geom size="0.1"/></worldbody>', "got no joints, want a robot that moves"),
+    "no actuators": (row("a"), "actuators: got none, want at"),
+    "nothing moves": (scene('<geom size="0.1"/>'), "got no joints, want a robot that moves"),
     "deformable": (
-        '<worldbody><body name="a"><joint name="a"/><geom size="0.1"/></body><flexcomp name="rope" type="grid" dim="1"'
-        ' count="3 1 1" spacing="0.1 0.1 0.1" mass="1" radius="0.01"/></worldbody>'
-        '<actuator><motor joint="a"/></actuator>',
+        row(
+            "a",
+            things='<flexcomp name="rope" type="grid" dim="1" count="3 1 1" spacing="0.1 0.1 0.1" mass="1" '
+            'radius="0.01"/>',
+            actuators='<motor joint="a"/>',
+        ),
         "deformable parts: got some, want rigid bodies",
     ),
 }
@@ -1277,7 +1245,7 @@ BAD = {
 def test_what_states_do_not_describe_is_refused(which: str) -> None:
     text, message = BAD[which]
     with pytest.raises(InputError, match=message) as refused:
-        ls.MjcfRobot(scene_from_xml(f"<mujoco>{text}</mujoco>", "bad"))
+        ls.MjcfRobot(scene_from_xml(text, "bad"))
     assert "\n" not in str(refused.value)
 
 
@@ -1325,15 +1293,16 @@ def test_ctrl_c_ends_an_iteration_that_would_take_minutes(solve: Any) -> None:
 
 def test_a_load_that_hangs_from_a_winch_is_at_rest() -> None:
     """It only pulls, and for a control near 0 as much as it can. By `mj_step` the load stays for half a second."""
-    robot = ls.MjcfRobot(scene_from_xml("""<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
-      <body name="trolley" pos="0 0 3"><joint name="trolley" type="slide" axis="1 0 0" damping="5"/>
-      <geom type="box" size="0.1 0.1 0.05" mass="10"/><site name="hook"/></body>
-      <body name="load" pos="0 0 1"><freejoint name="load"/><geom type="box" size="0.2 0.2 0.1" mass="6"/>
-      <site name="eye" pos="0 0 0.1"/></body></worldbody>
-      <tendon><spatial name="rope"><site site="hook"/><site site="eye"/></spatial></tendon>
-      <actuator><motor name="drive" joint="trolley"/>
-      <position name="winch" tendon="rope" kp="3000" kv="300" forcelimited="true" forcerange="-500 0"/></actuator>
-      </mujoco>""", "crane"))  # fmt: skip
+    rope = '<spatial name="rope"><site site="hook"/><site site="eye"/></spatial>'
+    winch = '<position name="winch" tendon="rope" kp="3000" kv="300" forcerange="-500 0"/>'
+    xml = row(
+        ("trolley", "load"), joints=('type="slide" axis="1 0 0" damping="5"', 'type="free"'), joint="",
+        places=("0 0 3", "0 0 1"), geom='type="box"',
+        geoms=('size="0.1 0.1 0.05" mass="10"', 'size="0.2 0.2 0.1" mass="6"'),
+        carried=('<site name="hook"/>', '<site name="eye" pos="0 0 0.1"/>'), more=f"<tendon>{rope}</tendon>",
+        actuators=motors(["trolley"]) + winch, option='timestep="0.002" integrator="implicitfast"',
+    )  # fmt: skip
+    robot = ls.MjcfRobot(scene_from_xml(xml, "crane"))
     state = robot.at()
     np.testing.assert_array_equal(robot.at_rest(state), state)
     data = mujoco.MjData(robot.scene.model)
@@ -1400,18 +1369,18 @@ def test_a_plan_with_dry_friction_is_replayed_by_mujocos_own_steps(loss: float) 
         ('<joint name="wheel" axis="0 1 0"/><geom type="cylinder" size="0.1 0.03"/>', False),
         ('<joint name="wheel" axis="0 1 0"/><geom size="0.1"/><body pos="0.1 0 0"><geom size="0.01"/></body>', False),
         ('<joint name="wheel" axis="0 1 0"/><geom type="sphere" size="0.1" pos="0.05 0 0"/>', False),
-        ('<joint name="wheel" axis="0 1 0" range="-90 90"/><geom type="sphere" size="0.1"/>', False),
+        ('<joint name="wheel" axis="0 1 0" range="-1 1"/><geom type="sphere" size="0.1"/>', False),
     ],
 )
 def test_the_turn_of_a_wheel_is_no_goal_unless_it_is_named(wheel: str, rolls: bool, tmp_path: Path) -> None:
     """A goal for it would hold it where it is: of all weights, those by which a wheel cannot roll on cost most."""
     path = tmp_path / "cart.xml"
-    path.write_text(
-        f"""<mujoco><option timestep="0.01" integrator="implicitfast"/><compiler autolimits="true"/><worldbody>
-        <geom type="plane" size="9 9 1"/><body pos="0 0 0.0999"><joint name="x" type="slide" axis="1 0 0"/>
-        <joint name="z" type="slide" axis="0 0 1"/><geom type="box" size="0.2 0.05 0.02" mass="3"/><body>{wheel}</body>
-        </body></worldbody><actuator><motor joint="wheel" ctrlrange="-5 5"/></actuator></mujoco>"""
-    )
+    text = sled(
+        "xz", place="0 0 0.0999", geom='type="box" size="0.2 0.05 0.02" mass="3"', carried=f"<body>{wheel}</body>",
+        things='<geom type="plane" size="9 9 1"/>', actuators=motors(["wheel"], [5]),
+        option='timestep="0.01" integrator="implicitfast"',
+    )  # fmt: skip
+    path.write_text(text)
     robot = ls.MjcfRobot(path)
     assert [joint.name for joint in robot.mjcf.wheels] == ["wheel"] * rolls
     begin = robot.at()
@@ -1439,11 +1408,9 @@ def test_a_wheel_may_be_of_parts_that_are_fixed_to_it(off: float, seed: int) -> 
     within, turned = rim.inv().apply(anchor + rng.normal() * axis + off * side - place), rim.inv() * tyre
     pos, centre, pivot, along = (" ".join(map(repr, v.tolist())) for v in (place, within, anchor, axis))
     quats = [" ".join(map(repr, turn.as_quat(scalar_first=True).tolist())) for turn in (rim, turned)]
-    xml = f"""<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="0.1"/><body>
-      <joint name="wheel" pos="{pivot}" axis="{along}"/><body pos="{pos}" quat="{quats[0]}">
-      <geom type="cylinder" size="0.1 0.03" pos="{centre}" quat="{quats[1]}"/><body name="cap"/></body></body></body>
-      </worldbody><actuator><motor joint="wheel"/></actuator></mujoco>"""
-    robot = ls.MjcfRobot(scene_from_xml(xml, "wheel"))
+    carried = f"""<body><joint name="wheel" pos="{pivot}" axis="{along}"/><body pos="{pos}" quat="{quats[0]}">
+      <geom type="cylinder" size="0.1 0.03" pos="{centre}" quat="{quats[1]}"/><body name="cap"/></body></body>"""
+    robot = ls.MjcfRobot(scene_from_xml(sled(carried=carried, actuators=motors(["wheel"])), "wheel"))
     assert [joint.name for joint in robot.mjcf.wheels] == ["wheel"] * (off == 0)
 
 

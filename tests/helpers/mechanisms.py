@@ -1,6 +1,7 @@
 """Robots and MJCFs that tests share, where what they are made of is not the point."""
 
 from collections.abc import Sequence
+from itertools import zip_longest
 
 import numpy as np
 
@@ -29,8 +30,12 @@ def motors(joints: Sequence[str], limits: Sequence[float] = ()) -> str:
     return "".join(f'<motor name="{one}" joint="{one}" {most}/>' for one, most in zip(joints, ranges, strict=True))
 
 
-def scene(bodies: str, actuators: str, *, option: str, things: str = "", more: str = "", default: str = "") -> str:
-    return f"""<mujoco><option {option}/><compiler angle="radian" autolimits="true"/>{default}
+def scene(
+    bodies: str, actuators: str = "", *, option: str = "", compiler: str = 'angle="radian"', before: str = "",
+    things: str = "", more: str = "",
+) -> str:  # fmt: skip
+    """An MJCF of these bodies and of things that are fixed; `before` and `more` are sections before and after them."""
+    return f"""<mujoco><option {option}/><compiler {compiler}/>{before}
       <worldbody>{things}{bodies}</worldbody>{more}<actuator>{actuators}</actuator></mujoco>"""
 
 
@@ -41,28 +46,33 @@ def arm(
     joints: Sequence[str] = ("", "", ""),
     geom: str = f'size="0.03" {NO_CONTACT}',
     geoms: Sequence[str] = ("", "", ""),
+    along: Sequence[float] = (1, 0, 0),
     gap: float = 0.0,
     place: str = "0 0 0",
     end: str = "",
     limits: Sequence[float] = (),
     actuators: str = "",
-    option: str = 'timestep="0.01" integrator="implicitfast"',
-    things: str = "",
-    more: str = "",
+    before: str = "",
+    **more: str,
 ) -> str:
-    """Capsules along x, each hinged to the end of the one before; `gap` is from a hinge to where its capsule begins.
+    """Capsules in a line, each hinged to the end of the one before; `gap` is from a hinge to where its capsule begins.
 
     `joint` and `geom` are attributes of all, `joints` and `geoms` those of each. Without actuators there are motors.
     """
+
+    def at(far: float) -> str:
+        return " ".join(str(far * one + 0.0) for one in along)
+
     bodies = end
     for k in reversed(range(len(lengths))):
-        at = f"{lengths[k - 1]} 0 0" if k else place
-        bodies = f"""<body name="{("upper", "fore", "hand")[k]}" pos="{at}">
+        bodies = f"""<body name="{("upper", "fore", "hand")[k]}" pos="{at(lengths[k - 1]) if k else place}">
           <joint name="{names[k]}" class="link" {joints[k]}/>
-          <geom class="link" type="capsule" fromto="{gap} 0 0 {lengths[k]} 0 0" {geoms[k]}/>{bodies}</body>"""
+          <geom class="link" type="capsule" fromto="{at(gap)} {at(lengths[k])}" {geoms[k]}/>{bodies}</body>"""
     default = f'<default><default class="link"><joint {joint}/><geom {geom}/></default></default>'
     driven = actuators or motors(names[: len(lengths)], limits)
-    return scene(bodies, driven, option=option, things=things, more=more, default=default)
+    return scene(
+        bodies, driven, **{"option": 'timestep="0.01" integrator="implicitfast"', **more}, before=default + before
+    )
 
 
 def sled(
@@ -76,11 +86,9 @@ def sled(
     carried: str = "",
     limits: Sequence[float] = (),
     actuators: str = "",
-    option: str = 'timestep="0.01" gravity="0 0 0"',
-    things: str = "",
-    more: str = "",
+    **more: str,
 ) -> str:
-    """A body, with a geom of the same name, that slides along these axes and carries others.
+    """A body, with a geom of the same name, that slides along these axes and carries others, or joints of its own.
 
     Joints have these names, by default those of the axes, and so have motors.
     """
@@ -90,7 +98,30 @@ def sled(
         for own, axis in zip(names, axes, strict=True)
     )
     body = f'<body name="{name}" pos="{place}">{slides}<geom name="{name}" {geom}/>{carried}</body>'
-    return scene(body, actuators or motors(names, limits), option=option, things=things, more=more)
+    return scene(body, actuators or motors(names, limits), **{"option": 'timestep="0.01" gravity="0 0 0"', **more})
+
+
+def row(
+    names: Sequence[str],
+    *,
+    joint: str = 'axis="0 1 0"',
+    joints: Sequence[str] = (),
+    geom: str = f'size="0.1" {NO_CONTACT}',
+    geoms: Sequence[str] = (),
+    places: Sequence[str] = (),
+    carried: Sequence[str] = (),
+    actuators: str = "",
+    **more: str,
+) -> str:
+    """Bodies beside one another, a metre apart or at these places, each on a joint of the same name."""
+    bodies = "".join(
+        f'<body name="{name}" pos="{place or f"0 {k} 0"}"><joint name="{name}" {joint} {turn}/>'
+        f"<geom {geom} {shape}/>{on}</body>"
+        for k, (name, turn, shape, place, on) in enumerate(
+            zip_longest(names, joints, geoms, places, carried, fillvalue="")
+        )
+    )
+    return scene(bodies, actuators, **more)
 
 
 # A free body with a ball joint and a hinge: its links move in other coordinates than MuJoCo's. {link} is the last
