@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from mechanisms import sled
+from mechanisms import motors, scene, sled
 from sampling import examples, rarely
 from scipy.spatial.transform import Rotation
 from tracking import track
@@ -44,15 +44,15 @@ def arm(own: str, other: str, seed: int) -> ls.MjcfRobot:
     obstacle = '<geom name="other" type="plane" size="1 1 1" pos="0 0 -0.6" euler="20 30 0"/>'
     if other != "plane":
         obstacle = f'<geom name="other" type="{other}" {SHAPES[other]} {far}/>'
-    xml = f"""<mujoco><asset><mesh name="rock" vertex="{rock(rng)}"/></asset><worldbody>
-      {obstacle}<geom name="ball" size="0.1" pos="-0.2 0.7 0.1"/>
-      <body name="hull"><freejoint/><geom name="hull" size="0.1"/>
-        <body name="upper" pos="0.2 0 0"><joint name="shoulder" type="ball"/>
-          <geom type="capsule" size="0.03" fromto="0.05 0 0 0.25 0 0"/>
-          <body name="fore" pos="0.3 0 0"><joint name="elbow" axis="0 1 0.3"/><joint name="reach" type="slide"/>
-            <geom name="tip" type="{own}" {SHAPES[own]} pos="0.1 0 0" euler="10 20 30"/></body></body></body>
-      </worldbody>
-      <actuator><motor joint="elbow"/></actuator></mujoco>"""
+    upper = f"""<body name="upper" pos="0.2 0 0"><joint name="shoulder" type="ball"/>
+      <geom type="capsule" size="0.03" fromto="0.05 0 0 0.25 0 0"/>
+      <body name="fore" pos="0.3 0 0"><joint name="elbow" axis="0 1 0.3"/><joint name="reach" type="slide"/>
+        <geom name="tip" type="{own}" {SHAPES[own]} pos="0.1 0 0" euler="10 20 30"/></body></body>"""
+    xml = sled(
+        "", name="hull", geom='size="0.1"', carried="<freejoint/>" + upper,
+        things=f'{obstacle}<geom name="ball" size="0.1" pos="-0.2 0.7 0.1"/>', actuators=motors(["elbow"]), option="",
+        before=f'<asset><mesh name="rock" vertex="{rock(rng)}"/></asset>', compiler="",
+    )  # fmt: skip
     axis = (None, "x", "y", "z")[seed % 4]
     return ls.MjcfRobot(scene_from_xml(xml, "arm", obstacles=False), obstacles=("other", "ball"), turns_about=axis)
 
@@ -288,17 +288,20 @@ def bodywise(robot: ls.MjcfRobot, state: Array) -> Array:
     ])  # fmt: skip
 
 
-ARM = """<mujoco><option timestep="0.01" integrator="implicitfast" gravity="0 0 {gravity}"/>
-  <asset><mesh name="rock" vertex="{rock}"/></asset><default><joint damping="0.2" armature="0.05"/></default><worldbody>
-  <geom name="floor" type="plane" size="2 2 1" pos="0 0 -0.5"/>
-  <geom name="post" type="{kind}" {size} pos="0.4 0.35 0"/>
-  <body name="pedestal" pos="0 0 0"><geom name="pedestal" type="mesh" mesh="rock"/>
+ARM = scene(
+    """<body name="pedestal" pos="0 0 0"><geom name="pedestal" type="mesh" mesh="rock"/>
     <body name="cover"><geom name="cover" size="0.06"/></body>
     <body name="upper"><joint name="a" axis="0 0 1"/><joint name="b" axis="0 1 0"/>
       <geom type="capsule" fromto="0.15 0 0 0.3 0 0" size="0.03"/>
       <body name="fore" pos="0.4 0 0"><joint name="c" axis="0 1 0"/>
-        <geom type="box" pos="0.12 0 0" size="0.1 0.03 0.03"/></body></body></body></worldbody>
-  <actuator><motor joint="a"/><motor joint="b"/><motor joint="c"/></actuator>{more}</mujoco>"""
+        <geom type="box" pos="0.12 0 0" size="0.1 0.03 0.03"/></body></body></body>""",
+    motors("abc"), option='timestep="0.01" integrator="implicitfast" gravity="0 0 {gravity}"', more="{more}",
+    before="""<asset><mesh name="rock" vertex="{rock}"/></asset>
+      <default><joint damping="0.2" armature="0.05"/></default>""",
+    things="""<geom name="floor" type="plane" size="2 2 1" pos="0 0 -0.5"/>
+      <geom name="post" type="{kind}" {size} pos="0.4 0.35 0"/>""",
+    compiler="",
+)  # fmt: skip
 
 
 def arm_file(folder: Path, kind: str = "mesh", more: str = "", gravity: float = 0.0) -> Path:
@@ -531,11 +534,14 @@ def test_excluded_bodies_and_other_bits_are_no_obstacles(tmp_path: Path) -> None
 
 
 def test_a_floor_is_for_who_can_sink_to_it(tmp_path: Path) -> None:
-    legged = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1"/><geom name="wall" type="box"
-      size="0.1 1 1" pos="2 0 0"/><body pos="0 0 0.2">{}<geom type="box" size="0.2 0.1 0.05"/><body pos="0.2 0 0">
-      <joint name="hip" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -0.15" size="0.03"/></body></body>
-      </worldbody>
-      <actuator><motor joint="hip"/></actuator></mujoco>"""
+    leg = """<body pos="0.2 0 0"><joint name="hip" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.15" size="0.03"/></body>"""
+    legged = sled(
+        "", place="0 0 0.2", geom='type="box" size="0.2 0.1 0.05"', carried="{}" + leg, actuators=motors(["hip"]),
+        things="""<geom name="floor" type="plane" size="1 1 1"/>
+          <geom name="wall" type="box" size="0.1 1 1" pos="2 0 0"/>""",
+        option="",
+    )  # fmt: skip
     for joints, found in (
         ("<freejoint/>", ("wall",)), ('<joint type="slide" axis="0 0 1"/>', ("wall",)),
         ('<joint type="slide" axis="1 0 0"/>', ("floor", "wall")),
@@ -549,13 +555,14 @@ def test_a_floor_is_for_who_can_sink_to_it(tmp_path: Path) -> None:
 
 
 PEDESTALS = {"cylinder": 'size="0.09 0.2"', "box": 'size="0.09 0.08 0.2"', "capsule": 'size="0.09 0.11"'}
-TURNED = """<mujoco><option timestep="0.01" integrator="implicitfast"/><compiler angle="radian"/><worldbody>
-  {pedestal}<body name="base" pos="0 0 {height}">{joint}<geom name="base" type="cylinder" size="0.06 0.05"/>
-    <body name="upper" pos="0 0 0.1"><joint name="b" axis="0 1 0" damping="0.3"/>
+TURNED = sled(
+    "", name="base", place="0 0 {height}", geom='type="cylinder" size="0.06 0.05"', things="{pedestal}",
+    carried="""{joint}<body name="upper" pos="0 0 0.1"><joint name="b" axis="0 1 0" damping="0.3"/>
       <geom name="upper" type="capsule" fromto="0 0 0 0 0 0.3" size="0.03"/>
       <body name="fore" pos="0 0 0.35"><joint name="c" axis="0 1 0" damping="0.3"/>
-        <geom name="fore" type="box" pos="0 0 0.15" size="0.02 0.02 0.12"/></body></body></body></worldbody>
-  <actuator><motor joint="b" ctrlrange="-9 9"/><motor joint="c" ctrlrange="-9 9"/></actuator></mujoco>"""
+        <geom name="fore" type="box" pos="0 0 0.15" size="0.02 0.02 0.12"/></body></body>""",
+    actuators=motors("bc", (9, 9)), option='timestep="0.01" integrator="implicitfast"',
+)  # fmt: skip
 
 
 @settings(max_examples=examples(16))
@@ -596,12 +603,13 @@ def test_a_pedestal_is_no_obstacle_of_the_link_that_it_carries(
     assert (run.outcome, run.contacts[0]) == (("reached",), 0)
 
 
-CARRIED = """<mujoco><option timestep="0.005"/><worldbody>{ground}
-  <geom name="post" type="cylinder" size="0.1 1" pos="2 0 1"/>
-  <body name="sled" pos="0 0 {height}">{joint}<geom type="box" size="0.1 0.1 0.05" mass="1"/>
-    <body name="pole" pos="0 0 0.1"><joint name="pole" axis="0 1 0"/>
-      <geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.02" mass="0.1"/></body></body></worldbody>
-  <actuator><motor joint="pole"/></actuator>{more}</mujoco>"""
+CARRIED = sled(
+    "", place="0 0 {height}", geom='type="box" size="0.1 0.1 0.05" mass="1"',
+    carried="""{joint}<body name="pole" pos="0 0 0.1"><joint name="pole" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.02" mass="0.1"/></body>""",
+    things='{ground}<geom name="post" type="cylinder" size="0.1 1" pos="2 0 1"/>', actuators=motors(["pole"]),
+    option='timestep="0.005"', more="{more}",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(

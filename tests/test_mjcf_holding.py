@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 from actuated import Rest, draw
-from mechanisms import NO_CONTACT, arm
+from mechanisms import NO_CONTACT, arm, motors, row, scene, sled
 
 import lqrsim as ls
 from lqrsim.errors import InputError
@@ -121,11 +121,13 @@ def test_too_weak_an_actuator_is_short_by_what_its_limit_leaves(joint: str, actu
 
 
 def test_bodies_that_overlap_are_named_where_nothing_settles() -> None:
-    text = """<mujoco><worldbody><geom type="plane" size="5 5 1"/>
-        <body name="car" pos="0 0 0.3"><freejoint/><geom type="box" size="0.2 0.1 0.05" mass="2"/>
-        <body name="fork" pos="0.1 0.12 0"><joint name="steer" axis="0 0 1"/><geom size="0.01" contype="0"/>
-        <body name="wheel"><joint axis="0 1 0"/><geom size="0.04"/></body></body></body></worldbody>
-        <actuator><motor joint="steer"/></actuator>{}</mujoco>"""
+    wheel = '<body name="wheel"><joint axis="0 1 0"/><geom size="0.04"/></body>'
+    fork = f"""<body name="fork" pos="0.1 0.12 0"><joint name="steer" axis="0 0 1"/><geom size="0.01" contype="0"/>
+      {wheel}</body>"""
+    text = sled(
+        "", name="car", place="0 0 0.3", geom='type="box" size="0.2 0.1 0.05" mass="2"', carried="<freejoint/>" + fork,
+        things='<geom type="plane" size="5 5 1"/>', actuators=motors(["steer"]), more="{}", option="",
+    )  # fmt: skip
     robot = ls.MjcfRobot(scene_from_xml(text.format(""), "car"))
     with pytest.raises(ls.InputError, match=r"(car and wheel|wheel and car) touch, which an <exclude>"):
         robot.at_rest(robot.at())
@@ -142,15 +144,12 @@ def test_bodies_that_overlap_are_named_where_nothing_settles() -> None:
     ],
 )
 def test_a_robot_above_its_ground_is_told_how_to_stand_on_it(joints: str) -> None:
-    robot = ls.MjcfRobot(
-        scene_from_xml(
-            f"""<mujoco><worldbody><geom type="plane" size="5 5 1"/>
-            <body name="base" pos="0 0 0.15">{joints}<geom type="box" size="0.1 0.1 0.1" mass="2"/>
-            <body><joint name="arm" axis="0 0 1"/><geom pos="0.2 0 0.1" size="0.02" mass="0.1"/></body></body>
-            </worldbody><actuator><motor joint="arm"/></actuator></mujoco>""",
-            "cart",
-        )
-    )
+    carried = '<body><joint name="arm" axis="0 0 1"/><geom pos="0.2 0 0.1" size="0.02" mass="0.1"/></body>'
+    xml = sled(
+        "", place="0 0 0.15", geom='type="box" size="0.1 0.1 0.1" mass="2"', carried=joints + carried,
+        things='<geom type="plane" size="5 5 1"/>', actuators=motors(["arm"]), option="",
+    )  # fmt: skip
+    robot = ls.MjcfRobot(scene_from_xml(xml, "cart"))
     assert f"; z is not held: {2.1 * 9.81:.3g} N are missing; what stands on the ground starts" in str(robot)
     assert robot._held(robot.at_rest(robot.at())).held  # what the text names helps
     assert "  obstacles: none\n  ground, which is no obstacle: unnamed_geom_0" in str(robot)
@@ -221,17 +220,16 @@ def test_a_keyframe_with_mocap_bodies_is_what_plans_and_runs_begin_from(seed: in
     tip = 0.3 * np.array([np.cos(q[0]) + np.cos(q.sum()), np.sin(q[0]) + np.sin(q.sum()), 0.0])
     told = {name: " ".join(map(repr, map(float, value))) for name, value in (("q", q), ("tip", tip), ("turn", turn))}
     file = tmp_path / "tied.xml"
-    file.write_text(f"""<mujoco><option timestep="0.005" integrator="implicitfast" gravity="0 -2 0"/><worldbody>
-      <body name="target" mocap="true" pos="0.6 0 0" euler="0 0 30"><geom size=".02" {NO_CONTACT}/></body>
-      <body name="upper"><joint name="shoulder" axis="0 0 1" damping=".5"/>
-      <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass=".5" {NO_CONTACT}/>
-      <body name="fore" pos=".3 0 0"><joint name="elbow" axis="0 0 1" damping=".5"/>
-      <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass=".5" {NO_CONTACT}/>
-      <body name="tip" pos=".3 0 0"><geom size=".02" mass=".1" {NO_CONTACT}/></body></body></body></worldbody>
-      <equality><connect body1="target" body2="tip" anchor="0 0 0"/></equality>
-      <actuator><motor name="m1" joint="shoulder"/><motor name="m2" joint="elbow"/></actuator>
-      <keyframe><key name="bent" qpos="{told["q"]}" mpos="{told["tip"]}" mquat="{told["turn"]}"/></keyframe>
-      </mujoco>""")
+    small = f'<geom size=".02" mass=".1" {NO_CONTACT}/>'
+    text = arm(
+        0.3, 0.3, joint='axis="0 0 1" damping=".5"', geom=f'size=".02" mass=".5" {NO_CONTACT}',
+        end=f'<body name="tip" pos=".3 0 0">{small}</body>',
+        things=f'<body name="target" mocap="true" pos="0.6 0 0" euler="0 0 0.5">{small}</body>',
+        more=f"""<equality><connect body1="target" body2="tip" anchor="0 0 0"/></equality>
+          <keyframe><key name="bent" qpos="{told["q"]}" mpos="{told["tip"]}" mquat="{told["turn"]}"/></keyframe>""",
+        option='timestep="0.005" integrator="implicitfast" gravity="0 -2 0"',
+    )  # fmt: skip
+    file.write_text(text)
     with pytest.raises(InputError, match=r"keyframe: got 'bent', in which the mocap bodies target are elsewhere"):
         ls.MjcfRobot(file).at("bent")
     with pytest.raises(InputError, match="keyframe: got 'straight', want one of: bent"):
@@ -256,20 +254,11 @@ def test_a_keyframe_with_mocap_bodies_is_what_plans_and_runs_begin_from(seed: in
 def test_a_follower_that_is_named_moves_what_it_follows(seed: int) -> None:
     """a follows b by a rising cubic, c follows a linearly: whichever is named, all are where the polynomials say."""
     rng = np.random.default_rng(seed)
-    offset, slope, cubic, ratio = (
-        rng.uniform(-0.05, 0.05),
-        rng.uniform(0.5, 2),
-        rng.uniform(0, 3),
-        rng.uniform(-2, -0.5),
-    )
-    bodies = "".join(
-        f'<body pos="0 {k} 0"><joint name="{name}" type="slide" axis="0 0 1"/><geom size="0.1" {NO_CONTACT}/></body>'
-        for k, name in enumerate("abcd")
-    )
-    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><worldbody>{bodies}</worldbody><equality>
-      <joint joint1="a" joint2="b" polycoef="{offset} {slope} 0 {cubic}"/>
-      <joint joint1="c" joint2="a" polycoef="0 {ratio}"/></equality>
-      <actuator><motor joint="b"/><motor joint="d"/></actuator></mujoco>""", "cams"), position=())  # fmt: skip
+    offset, slope, cubic, ratio = rng.uniform((-0.05, 0.5, 0, -2), (0.05, 2, 3, -0.5))
+    ties = f"""<joint joint1="a" joint2="b" polycoef="{offset} {slope} 0 {cubic}"/>
+      <joint joint1="c" joint2="a" polycoef="0 {ratio}"/>"""
+    xml = row("abcd", joint='type="slide"', more=f"<equality>{ties}</equality>", actuators=motors("bd"))
+    robot = ls.MjcfRobot(scene_from_xml(xml, "cams"), position=())
     b = rng.uniform(-0.3, 0.3)
     a = offset + slope * b + cubic * b**3
     wanted = [a, b, ratio * a, 0.2]
@@ -280,29 +269,28 @@ def test_a_follower_that_is_named_moves_what_it_follows(seed: int) -> None:
 
 
 def test_free_joints_without_a_name_are_told_apart_by_their_bodies() -> None:
-    bodies = """<body name="drone" pos="0 0 1"><freejoint/><geom size=".1" mass="1"/><site name="s"/></body>
-      <body name="box" pos="1 0 .1"><joint type="free"/><geom size=".1" mass=".2"/></body>"""
-    thrust = '<actuator><motor name="lift" site="s" gear="0 0 1 0 0 0"/></actuator>'
-    twice = f'<replicate count="2" offset="0 1 0">{bodies.split("<body")[2].join(["<body", ""])}</replicate>'
-    for more, extra in (("", ()), (twice.replace('"box"', '"ball"'), ("ball0", "ball1"))):
-        xml = f"<mujoco><worldbody>{bodies}{more}</worldbody>{thrust}</mujoco>"
-        names = ls.MjcfRobot(scene_from_xml(xml, "two")).dynamics.state_coordinates.names
-        assert {"drone_x", "drone_wz", "box_x", "box_rz", *(f"{one}_z" for one in extra)} <= set(names)
-    alone = f"<mujoco><worldbody>{bodies.split('<body name=' + chr(34) + 'box')[0]}</worldbody>{thrust}</mujoco>"
-    assert ls.MjcfRobot(scene_from_xml(alone, "one")).dynamics.state_coordinates.names[:3] == ("x", "y", "z")
+    drone = '<body name="drone" pos="0 0 1"><freejoint/><geom size=".1" mass="1"/><site name="s"/></body>'
+    box = '<body name="box" pos="1 0 .1"><joint type="free"/><geom size=".1" mass=".2"/></body>'
+    twice = f'<replicate count="2" offset="0 1 0">{box.replace("box", "ball")}</replicate>'
+
+    def names(bodies: str) -> tuple[str, ...]:
+        xml = scene(bodies, '<motor name="lift" site="s" gear="0 0 1 0 0 0"/>')
+        return ls.MjcfRobot(scene_from_xml(xml, "two")).dynamics.state_coordinates.names
+
+    assert {"drone_x", "drone_wz", "box_x", "box_rz"} <= set(names(drone + box))
+    assert {"drone_x", "box_x", "ball0_z", "ball1_z"} <= set(names(drone + box + twice))
+    assert names(drone)[:3] == ("x", "y", "z")
 
 
 @pytest.mark.parametrize("most", [5.0, 1.0])
 def test_adhesion_between_two_bodies_that_touch(most: float) -> None:
     """A motor carries two spheres of which the upper one is stuck to it, or falls short by what MuJoCo accelerates."""
-    bodies = "".join(
-        f'<body name="{name}" pos="0 0 {height}"><joint name="{name}" type="slide" axis="0 0 1" damping="5"'
-        ' stiffness="50"/><geom size=".05" mass=".2"/></body>'
-        for name, height in (("a", 0.0), ("b", 0.0995))
-    )
-    robot = ls.MjcfRobot(scene_from_xml(f"""<mujoco><option integrator="implicitfast"/><compiler autolimits="true"/>
-      <worldbody>{bodies}</worldbody><actuator><adhesion name="stick" body="a" gain="20" ctrlrange="0 3"/>
-      <motor joint="a" ctrlrange="{-most} {most}"/></actuator></mujoco>""", "stuck"), position=())  # fmt: skip
+    xml = row(
+        "ab", joint='type="slide" axis="0 0 1" damping="5" stiffness="50"', geom='size=".05" mass=".2"',
+        places=("0 0 0", "0 0 0.0995"), option='integrator="implicitfast"',
+        actuators='<adhesion name="stick" body="a" gain="20" ctrlrange="0 3"/>' + motors("a", [most]),
+    )  # fmt: skip
+    robot = ls.MjcfRobot(scene_from_xml(xml, "stuck"), position=())
     state, model = robot.at(a=0.01, b=0.0096), robot.scene.model
     held, rest = robot._held(state), Rest(model, robot.configuration(state)[0])
     np.testing.assert_allclose(held.missed, -rest.forces(held.controls), rtol=0, atol=1e-9)

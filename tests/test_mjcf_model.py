@@ -98,8 +98,6 @@ ACTUATORS = {
     "pid": ('<pid {on} kp="20" kv="2" ki="5" input="pos vel"/>', False),
     "dcmotor": ('<dcmotor {on} motorconst="0.5 0.5" resistance="2"/>', False),
 }
-ONE = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="turn" type="{kind}" axis="0 1 0" {limits}/>
-  <geom size=".1"/></body></worldbody><actuator>{actuator}</actuator></mujoco>"""
 
 
 @pytest.mark.parametrize("kind", ["hinge", "slide"])
@@ -108,7 +106,8 @@ ONE = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="turn" ty
 def test_forces_of_actuators_are_those_of_mujoco(name: str, limits: str, kind: str) -> None:
     """The record's gain, bias and limits, at random states, against `mj_forward`."""
     text, affine = ACTUATORS[name]
-    mjcf = MjcfModel(name, ONE.format(kind=kind, limits=limits, actuator=text.format(on='name="a" joint="turn"')))
+    joint, driven = f'type="{kind}" axis="0 1 0" {limits}', text.format(on='name="a" joint="turn"')
+    mjcf = MjcfModel(name, mechanisms.row(["turn"], joint=joint, actuators=driven, option='gravity="0 0 0"'))
     (actuator,), (joint,) = mjcf.actuators, mjcf.joints
     assert (actuator.name, actuator.joint) == ("a", "turn")
     assert joint.forces == ((-6, 3) if limits else (-np.inf, np.inf))
@@ -134,14 +133,18 @@ def test_forces_of_actuators_are_those_of_mujoco(name: str, limits: str, kind: s
     assert (clipped > 0) == (affine and name in ("motor", "position"))
 
 
-HAND = """<mujoco model="hand"><worldbody><body name="hand"><freejoint/><geom size=".1"/><site name="palm"/>
-  <body><joint axis="0 1 0"/><geom size=".1"/></body></body></worldbody>
-  <actuator><motor site="palm" gear="0 0 1 0 0 0"/></actuator></mujoco>"""
-TWO = """<mujoco><asset><model name="hand" file="hand.xml"/></asset><worldbody>
-  <body name="b"><body name="c"><geom size=".1"/></body><geom size=".2"/></body><geom type="box" size="1 1 .1"/>
-  <replicate count="2" offset="1 0 0"><body name="r"><geom size=".1" mass="1"/></body></replicate>
-  <frame pos="0 0 1"><attach model="hand" body="hand" prefix="left_"/></frame>
-  <frame pos="0 1 1"><attach model="hand" body="hand" prefix="right_"/></frame></worldbody></mujoco>"""
+HAND = mechanisms.scene(
+    """<body name="hand"><freejoint/><geom size=".1"/><site name="palm"/>
+    <body><joint axis="0 1 0"/><geom size=".1"/></body></body>""",
+    '<motor site="palm" gear="0 0 1 0 0 0"/>',
+)
+TWO = mechanisms.scene(
+    """<body name="b"><body name="c"><geom size=".1"/></body><geom size=".2"/></body><geom type="box" size="1 1 .1"/>
+    <replicate count="2" offset="1 0 0"><body name="r"><geom size=".1" mass="1"/></body></replicate>
+    <frame pos="0 0 1"><attach model="hand" body="hand" prefix="left_"/></frame>
+    <frame pos="0 1 1"><attach model="hand" body="hand" prefix="right_"/></frame>""",
+    before='<asset><model name="hand" file="hand.xml"/></asset>',
+)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from typing import Any
 import mjcf_files
 import numpy as np
 import pytest
+from mechanisms import NO_CONTACT, motors, row, scene, sled
 
 import lqrsim as ls
 from lqrsim.codegen import compiled_module
@@ -15,20 +16,20 @@ from lqrsim.scenes.scene import scene_from_xml
 
 # A cart that drags on the floor and carries a pole, which has a stiff hinge, a rotor and dry friction; a servo drives
 # the pole. The attributes of the pole's joint come from a class, where they are not to be changed for others.
-FILE = """<mujoco><option timestep="0.005" density="{density}" viscosity="{viscosity}"/>
-  <compiler {compiler}/>
-  <default><default class="stiff"><joint stiffness="{stiffness}" damping="{damping}"/></default></default>
-  <worldbody><geom name="floor" type="plane" size="5 5 0.1" friction="0.1"/><body name="cart" pos="0 0 0.098">
-    <joint name="slider" type="slide" axis="1 0 0"/><joint name="lift" type="slide" axis="0 0 1"/>
-    <geom name="hull" type="box" size="0.1 0.1 0.1" mass="{cart}" friction="{friction} 0.01 0.001"/>
-    <site name="hook" pos="0 0 0.1"/>
-    <body name="pole"><joint name="hinge" class="stiff" axis="0 1 0" armature="{armature}" frictionloss="{loss}"/>
-      <geom type="capsule" fromto="0 0 0 0 0 0.5" size="0.02" mass="{pole}" contype="0" conaffinity="0"/>
-      <geom type="sphere" pos="0 0 0.5" size="0.05" mass="{tip}" contype="0" conaffinity="0"/>
-      <body name="vane" pos="0 0 0.5"><joint name="spin" class="stiff" axis="0 0 1"/><geom type="box"
-        size="0.1 0.01 0.1" density="300" contype="0" conaffinity="0"/></body></body></body></worldbody>
-  <actuator><motor name="pull" site="hook" gear="{gear}"/><position name="turn" joint="hinge" kp="2"/></actuator>
-</mujoco>"""
+FILE = sled(
+    "xz", name="cart", names=("slider", "lift"), place="0 0 0.098",
+    geom='type="box" size="0.1 0.1 0.1" mass="{cart}" friction="{friction} 0.01 0.001"',
+    carried=f"""<site name="hook" pos="0 0 0.1"/><body name="pole">
+      <joint name="hinge" class="stiff" axis="0 1 0" armature="{{armature}}" frictionloss="{{loss}}"/>
+      <geom type="capsule" fromto="0 0 0 0 0 0.5" size="0.02" mass="{{pole}}" {NO_CONTACT}/>
+      <geom type="sphere" pos="0 0 0.5" size="0.05" mass="{{tip}}" {NO_CONTACT}/>
+      <body name="vane" pos="0 0 0.5"><joint name="spin" class="stiff" axis="0 0 1"/>
+        <geom type="box" size="0.1 0.01 0.1" density="300" {NO_CONTACT}/></body></body>""",
+    things='<geom name="floor" type="plane" size="5 5 0.1" friction="0.1"/>',
+    before='<default><default class="stiff"><joint stiffness="{stiffness}" damping="{damping}"/></default></default>',
+    actuators='<motor name="pull" site="hook" gear="{gear}"/><position name="turn" joint="hinge" kp="2"/>',
+    option='timestep="0.005" density="{density}" viscosity="{viscosity}"', compiler="{compiler}",
+)  # fmt: skip
 STATED: dict[str, Any] = {
     "density": 1.2, "viscosity": 0.01, "compiler": "", "stiffness": 0.5, "damping": "0.1 0.02", "cart": 1.0,
     "friction": 0.4, "armature": 0.01, "loss": 0.02, "pole": 0.2, "tip": 0.1, "gear": "2 0 0.5 0 0 0.1",
@@ -57,11 +58,11 @@ CASES: dict[str, tuple[dict[str, float], dict[str, Any]]] = {
     "hinge_stiffness": ({"hinge_stiffness": 0.9, "spin_stiffness": 0.9}, {"stiffness": 0.9}),
     "hinge_armature": ({"hinge_armature": 0.03}, {"armature": 0.03}),
     "hinge_frictionloss": ({"hinge_frictionloss": 0.08}, {"loss": 0.08}),
-    "hull_friction": ({"hull_friction": 0.9}, {"friction": 0.9}),
+    "cart_friction": ({"cart_friction": 0.9}, {"friction": 0.9}),
     "pull_gear": ({"pull_gear": 3.0}, {"gear": "3 0 0.75 0 0 0.15"}),
     "density": ({"density": 5.0}, {"density": 5.0}),
     "viscosity": ({"viscosity": 0.2}, {"viscosity": 0.2}),
-    "several": ({"cart_mass": 0.7, "hull_friction": 0.9}, {"cart": 0.7, "friction": 0.9}),
+    "several": ({"cart_mass": 0.7, "cart_friction": 0.9}, {"cart": 0.7, "friction": 0.9}),
 }
 
 
@@ -101,11 +102,12 @@ def test_masses_however_they_came_about(compiler: str) -> None:
 
 
 # A free body that MuJoCo gives the axes of its inertia; geoms are where they are on it, whatever its mass is.
-ALIGNED = """<mujoco><compiler alignfree="{all}"/><worldbody>
-  <body name="stone" pos="0 0 1" euler="{turn}">{joint}
-    <geom type="capsule" size="0.05" fromto="0 0 0 1 0 0" mass="{a}"/>
-    <geom size="0.1" pos="{place}" mass="{b}"/></body></worldbody>
-  <actuator><motor name="pull" joint="free" gear="1 0 0 0 0 0"/></actuator></mujoco>"""
+ALIGNED = scene(
+    """<body name="stone" pos="0 0 1" euler="{turn}">{joint}<geom size="0.1" pos="{place}" mass="{b}"/>
+    <geom type="capsule" size="0.05" fromto="0 0 0 1 0 0" mass="{a}"/></body>""",
+    '<motor name="pull" joint="free" gear="1 0 0 0 0 0"/>',
+    compiler='alignfree="{all}"',
+)
 ALIGNING = {
     "its own": {"joint": '<freejoint name="free" align="true"/>'},
     "of all": {"joint": '<freejoint name="free"/>', "all": "true"},
@@ -131,9 +133,10 @@ def test_a_free_body_of_another_mass_keeps_its_shape_where_mujoco_aligns_it(alig
 
 
 # A spring of a frequency, and servos of a damping ratio, which MuJoCo computes from masses.
-DAMPED = """<mujoco><default>{of_class}</default><worldbody><body name="arm">
-  <joint name="hinge" axis="0 1 0" armature="0.1" {spring}/><geom type="capsule" size="0.05" fromto="0 0 0 1 0 0"/>
-  </body></worldbody><actuator><{servo} name="turn" joint="hinge" {damping}/></actuator></mujoco>"""
+DAMPED = row(
+    ["hinge"], joint='axis="0 1 0" armature="0.1" {spring}', geom='type="capsule" size="0.05" fromto="0 0 0 1 0 0"',
+    before="<default>{of_class}</default>", actuators='<{servo} name="turn" joint="hinge" {damping}/>',
+)  # fmt: skip
 DAMPERS = {
     "spring": {"spring": 'springdamper="0.5 0.3"', "servo": "motor"},
     "spring of a class": {"of_class": '<joint springdamper="0.5 0.3"/>', "servo": "motor"},
@@ -143,7 +146,13 @@ DAMPERS = {
     "general": {"servo": "general", "damping": 'gainprm="9" biastype="affine" biasprm="0 -9 0.7"'},
     "spring and servo": {"spring": 'springdamper="0.5 0.3"', "servo": "position", "damping": 'kp="9" dampratio="1"'},
 }
-CHANGES = [{"mass": 3.0}, {"arm_mass": 20.0}, {"hinge_stiffness": 2.0}, {"hinge_damping": 1.5}, {"hinge_armature": 0.3}]
+CHANGES = [
+    {"mass": 3.0},
+    {"hinge_mass": 20.0},
+    {"hinge_stiffness": 2.0},
+    {"hinge_damping": 1.5},
+    {"hinge_armature": 0.3},
+]
 
 
 @pytest.mark.parametrize("damper", DAMPERS)
@@ -153,8 +162,8 @@ def test_a_number_is_changed_and_no_other_where_mujoco_computes_them(damper: str
     robot = ls.MjcfRobot(scene_from_xml(DAMPED.format(**stated), "arm"))
     changed = robot.with_parameters(**change)
     expected = robot.dynamics.numbers | change
-    mass = change.get("mass", change.get("arm_mass", expected["mass"]))
-    assert changed.dynamics.numbers == pytest.approx(expected | {"mass": mass, "arm_mass": mass}, rel=1e-12)
+    mass = change.get("mass", change.get("hinge_mass", expected["mass"]))
+    assert changed.dynamics.numbers == pytest.approx(expected | {"mass": mass, "hinge_mass": mass}, rel=1e-12)
     for field in ("actuator_biasprm", "actuator_gainprm"):
         before, after = (getattr(of.scene.model, field) for of in (robot, changed))
         np.testing.assert_allclose(after, before, rtol=1e-12, err_msg=field)
@@ -165,9 +174,10 @@ def test_a_number_is_changed_and_no_other_where_mujoco_computes_them(damper: str
 )
 def test_all_numbers_of_a_robot_that_sticks_can_be_changed(others: str) -> None:
     """Adhesion has a gear in the model, but none in the text."""
-    xml = f"""<mujoco><worldbody><geom name="floor" type="plane" size="1 1 0.1"/><body name="foot" pos="0 0 0.1">
-      <joint name="lift" type="slide" axis="0 0 1"/><geom name="sole" size="0.1"/></body></worldbody>
-      <actuator><adhesion name="stick" body="foot" ctrlrange="0 1" gain="3"/>{others}</actuator></mujoco>"""
+    xml = sled(
+        "z", names=["lift"], name="foot", place="0 0 0.1", things='<geom name="floor" type="plane" size="1 1 0.1"/>',
+        actuators=f'<adhesion name="stick" body="foot" ctrlrange="0 1" gain="3"/>{others}', option="",
+    )  # fmt: skip
     robot = ls.MjcfRobot(scene_from_xml(xml, "foot"), position=())
     for name, number in robot.dynamics.numbers.items():
         assert robot.dynamics.with_parameters(**{name: number + 1.0}).numbers[name] == pytest.approx(number + 1.0)
@@ -176,7 +186,7 @@ def test_all_numbers_of_a_robot_that_sticks_can_be_changed(others: str) -> None:
 def test_changes_add_up_and_the_first_keeps_its_own() -> None:
     dynamics = robot_of().dynamics
     before, data = stepped(dynamics), dynamics.numbers
-    heavy = dynamics.with_parameters(cart_mass=3.0).with_parameters(hull_friction=0.2)
+    heavy = dynamics.with_parameters(cart_mass=3.0).with_parameters(cart_friction=0.2)
     np.testing.assert_allclose(stepped(heavy), stepped(robot_of(cart=3.0, friction=0.2).dynamics), atol=1e-12)
     np.testing.assert_array_equal(stepped(dynamics), before)
     assert dynamics.numbers == data
@@ -239,8 +249,7 @@ def test_bodies_that_the_text_does_not_have_keep_their_masses() -> None:
     """Replicas have names that the text has not: their masses have no place in it, and nobody's is changed."""
     part = '<body name="{}"><joint name="{}" type="slide"/><geom size="0.1" mass="1"/></body>'
     world = part.format("single", "slide") + f'<replicate count="2">{part.format("twin", "own")}</replicate>'
-    xml = f'<mujoco><worldbody>{world}</worldbody><actuator><motor joint="slide"/></actuator></mujoco>'
-    dynamics = ls.MjcfRobot(scene_from_xml(xml, "twins")).dynamics
+    dynamics = ls.MjcfRobot(scene_from_xml(scene(world, motors(["slide"])), "twins")).dynamics
     assert dynamics.physics.model.nbody == 4
     assert "slide_damping" in dynamics.numbers
     assert not [name for name in dynamics.numbers if name.endswith("mass")]

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 from linear_plans import by_hand
+from mechanisms import motors, row, scene, sled
 
 import lqrsim as ls
 from lqrsim.disturbances import MassMismatch, Payload, Unknown
@@ -14,20 +15,14 @@ from lqrsim.scenes.scene import scene_from_xml
 GRAVITY, LENGTH, OWN, ARMATURE = 9.81, 0.5, 0.4, 0.05  # m/s^2, m, kg, kg m^2
 
 # A beam on a hinge, that points along x; its hand's centre of mass is LENGTH from the hinge.
-BEAM = f"""
-<mujoco model="beam">
-  <option timestep="0.01" integrator="implicitfast"/>
-  <worldbody>
-    <body name="beam">
-      <joint name="hinge" axis="0 -1 0" damping="0.5" armature="{ARMATURE}"/>
-      <inertial pos="0.2 0 0" mass="1" diaginertia="0.01 0.02 0.03"/>
-      <body name="hand" pos="0.4 0 0">
-        <inertial pos="0.1 0 0" mass="{OWN}" diaginertia="0.001 0.001 0.001"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator><motor name="turn" joint="hinge" ctrlrange="-50 50" ctrllimited="true"/></actuator>
-</mujoco>"""
+BEAM = scene(
+    f"""<body name="beam"><joint name="hinge" axis="0 -1 0" damping="0.5" armature="{ARMATURE}"/>
+    <inertial pos="0.2 0 0" mass="1" diaginertia="0.01 0.02 0.03"/>
+    <body name="hand" pos="0.4 0 0">
+      <inertial pos="0.1 0 0" mass="{OWN}" diaginertia="0.001 0.001 0.001"/></body></body>""",
+    motors(["hinge"], [50]),
+    option='timestep="0.01" integrator="implicitfast"',
+)
 INERTIA = ARMATURE + 0.02 + 0.2**2 + 0.001 + OWN * LENGTH**2  # about the hinge
 
 
@@ -111,19 +106,11 @@ def test_what_cannot_carry_a_load_is_refused_by_name() -> None:
     assert ls.uncertainty_of(scenario.plant(), [Payload(0.1, "quadrotor")]).unknowns == (Unknown({"mass": 1.0}, 0.1),)
 
 
-TWO = """
-<mujoco model="two carts">
-  <option timestep="0.01" gravity="0 0 -10"/>
-  <worldbody>
-    <body name="left"><joint name="left" type="slide" axis="1 0 0"/><geom size="0.1" mass="1"/></body>
-    <body name="right" pos="0 1 0">
-      <joint name="right" type="slide" axis="1 0 0"/><geom size="0.1" mass="2"/>
-      <body name="tip" pos="0 0 0.3"><geom size="0.1" mass="0.5"/></body>
-    </body>
-  </worldbody>
-  <actuator><motor name="left" joint="left"/><motor name="right" joint="right"/></actuator>
-</mujoco>
-"""
+TWO = row(
+    ("left", "right"), joint='type="slide" axis="1 0 0"', geom='size="0.1"', geoms=('mass="1"', 'mass="2"'),
+    carried=("", '<body name="tip" pos="0 0 0.3"><geom size="0.1" mass="0.5"/></body>'),
+    actuators=motors(("left", "right")), option='timestep="0.01" gravity="0 0 -10"',
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -164,16 +151,10 @@ def unknowns_of_disturbance(plant: ls.Plant, disturbance: ls.disturbances.Distur
 
 def test_a_free_body_is_loaded() -> None:
     """Thrust / mass - gravity: the load has inertia as well as weight. MuJoCo keeps the inertia of such a body."""
-    free = """
-    <mujoco model="free">
-      <option timestep="0.01" gravity="0 0 -10"/>
-      <worldbody>
-        <body name="drone">
-          <freejoint name="drone"/><geom type="box" size="0.1 0.2 0.05" mass="1.5"/><site name="s"/>
-        </body>
-      </worldbody>
-      <actuator><motor name="thrust" site="s" gear="0 0 1 0 0 0"/></actuator>
-    </mujoco>"""
+    free = row(
+        ["drone"], joint='type="free"', geom='type="box" size="0.1 0.2 0.05" mass="1.5"', carried=['<site name="s"/>'],
+        actuators='<motor name="thrust" site="s" gear="0 0 1 0 0 0"/>', option='timestep="0.01" gravity="0 0 -10"',
+    )  # fmt: skip
     robot = ls.MjcfRobot(scene_from_xml(free, "free"))
     loaded = robot.dynamics.disturbed.with_parameters(drone_load=0.5)
     rise = robot.dynamics.state_coordinates.names.index("drone_vz")
@@ -181,20 +162,18 @@ def test_a_free_body_is_loaded() -> None:
         assert loaded.step(turned, [30.0], 0.01)[rise] == pytest.approx((30.0 / 2.0 - 10.0) * 0.01, rel=1e-9)
 
 
-SPRINGY = """
-<mujoco model="springy"><option timestep="0.005"/><compiler angle="radian" autolimits="true"/><worldbody>
-  <geom name="floor" type="plane" size="3 3 1"/>
-  <body name="box" pos="0 0 0.1"><freejoint name="f"/>
-    <inertial pos="0 0 0" mass="{box}" diaginertia="0.01 0.02 0.02"/><geom type="box" size="0.1 0.1 0.1"/>
+SPRINGY = sled(
+    "", name="box", place="0 0 0.1", geom='type="box" size="0.1 0.1 0.1"',
+    carried="""<freejoint name="f"/><inertial pos="0 0 0" mass="{box}" diaginertia="0.01 0.02 0.02"/>
     <body name="arm" pos="0 0 0.15"><joint name="a" axis="0 1 0" range="-0.3 0.3" frictionloss="0.2" armature="0.01"/>
       <inertial pos="0.05 0 0.1" mass="{arm}" diaginertia="0.002 0.002 0.001"/>
       <body name="hand" pos="0 0 0.25"><joint name="h" type="slide" axis="1 0 0" range="-0.05 0.05" frictionloss="0.1"/>
-        <inertial pos="0 0 0" mass="{hand}" diaginertia="0.001 0.001 0.001"/></body></body></body></worldbody>
-  <tendon><fixed name="t" range="-0.2 0.2" frictionloss="0.05">
-    <joint joint="a" coef="1"/><joint joint="h" coef="2"/></fixed></tendon>
-  <equality><joint joint1="h" joint2="a" polycoef="0 0.1 0 0 0"/></equality>
-  <actuator><motor name="a" joint="a" ctrlrange="-5 5"/><motor name="h" joint="h" ctrlrange="-5 5"/></actuator></mujoco>
-"""
+        <inertial pos="0 0 0" mass="{hand}" diaginertia="0.001 0.001 0.001"/></body></body>""",
+    things='<geom name="floor" type="plane" size="3 3 1"/>', actuators=motors("ah", (5, 5)), option='timestep="0.005"',
+    more="""<tendon><fixed name="t" range="-0.2 0.2" frictionloss="0.05">
+      <joint joint="a" coef="1"/><joint joint="h" coef="2"/></fixed></tendon>
+    <equality><joint joint1="h" joint2="a" polycoef="0 0.1 0 0 0"/></equality>""",
+)  # fmt: skip
 MASSES = {"box": 1.0, "arm": 0.3, "hand": 0.2}
 
 
