@@ -12,7 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from mechanisms import Jointed
+from mechanisms import Jointed, motors, row, scene
 from sampling import examples
 from tracking import hover, track, weave
 
@@ -156,19 +156,14 @@ def test_progress_counts_the_control_periods(cage):
 
 # A robot, a scene and disturbances of a user's own, outside the package.
 
-SLED = """<mujoco>
-  <option timestep="0.01"/>
-  <worldbody>
-    <geom type="box" size="0.1 1 1" pos="3 0 0"/>
-    <body name="sled">
+SLED = scene(
+    """<body name="sled">
       <joint name="along" type="slide" axis="1 0 0"/> <joint name="across" type="slide" axis="0 1 0"/>
       <geom type="sphere" size="0.1" mass="2"/>
-    </body>
-  </worldbody>
-  <actuator>
-    <motor name="push" joint="along" ctrlrange="-5 5"/> <motor name="steer" joint="across" ctrlrange="-5 5"/>
-  </actuator>
-</mujoco>"""
+    </body>""",
+    motors(("along", "across"), (5, 5)).replace('name="along"', 'name="push"').replace('name="across"', 'name="steer"'),
+    things='<geom type="box" size="0.1 1 1" pos="3 0 0"/>', option='timestep="0.01"',
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -468,11 +463,11 @@ def test_the_robot_passes_through_what_a_choice_of_obstacles_leaves_out(robot, n
 
 def test_what_a_choice_of_obstacles_leaves_out_still_carries_other_bodies(tmp_path):
     path = tmp_path / "room.xml"
-    path.write_text("""<mujoco><include file="quadrotor.xml"/><worldbody>
-      <geom name="table" type="box" size=".3 .3 .1" pos="0 0 -.9"/>
+    things = """<geom name="table" type="box" size=".3 .3 .1" pos="0 0 -.9"/>
       <geom name="shelf" type="box" size=".1 .1 .1" pos="0 0 .9"/>
-      <body name="crate" pos="0 0 -.7"><freejoint/><geom type="box" size=".1 .1 .1" mass="1"/></body>
-    </worldbody><contact><pair geom1="quadrotor_sphere" geom2="shelf"/></contact></mujoco>""")
+      <body name="crate" pos="0 0 -.7"><freejoint/><geom type="box" size=".1 .1 .1" mass="1"/></body>"""
+    pair = '<contact><pair geom1="quadrotor_sphere" geom2="shelf"/></contact>'
+    path.write_text(scene(things, before='<include file="quadrotor.xml"/>', more=pair))
     plant, plan = Plant(Quadrotor(), load_scene(path, obstacles=False)), hover()
     run = simulate(plant, plan, disturbances=[Push((0.0, 0.0, 3.0), at=0.0)])
     assert run.states[0, :, 2].max() > 0.9  # through the shelf
@@ -487,8 +482,8 @@ def test_a_pair_of_the_mjcf_is_no_wall_without_contacts(attributes, impulse, tmp
     runs = []
     for pair in ("", f'<contact><pair geom1="quadrotor_sphere" geom2="shelf" {attributes}/></contact>'):
         path = tmp_path / "room.xml"
-        path.write_text(f"""<mujoco><include file="quadrotor.xml"/><worldbody>
-          <geom name="shelf" type="box" size=".5 .5 .1" pos="0 0 .9"/></worldbody>{pair}</mujoco>""")
+        shelf = '<geom name="shelf" type="box" size=".5 .5 .1" pos="0 0 .9"/>'
+        path.write_text(scene(shelf, before='<include file="quadrotor.xml"/>', more=pair))
         plant, push = Plant(Quadrotor(), load_scene(path)), Push((0.0, 0.0, impulse), at=0.0)
         runs.append(simulate(plant, hover(), disturbances=[push], contacts=False))
     assert runs[0].outcome == ("collided",)
@@ -499,10 +494,11 @@ def test_a_pair_of_the_mjcf_is_no_wall_without_contacts(attributes, impulse, tmp
 
 # Plans that their own undisturbed run leaves, and MuJoCo's warnings.
 
-BILLIARD = """<mujoco><option timestep="0.005" gravity="0 0 0"/><worldbody>
-  <body><joint name="x" type="slide" axis="1 0 0"/><geom type="sphere" size="0.05" mass="1"/></body>
-  <body pos="1 0 0"><joint name="y" type="slide" axis="1 0 0" ref="1"/><geom type="box" size=".05 .05 .05" mass="5"/>
-  </body></worldbody><actuator><motor name="push" joint="x" ctrlrange="-9 9"/></actuator></mujoco>"""
+BILLIARD = row(
+    "xy", joint='type="slide" axis="1 0 0"', joints=("", 'ref="1"'), places=("0 0 0", "1 0 0"), geom="",
+    geoms=('size="0.05" mass="1"', 'type="box" size=".05 .05 .05" mass="5"'), actuators=motors("x", [9]),
+    option='timestep="0.005" gravity="0 0 0"',
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -564,9 +560,10 @@ def test_warnings_of_mujoco_are_counted_and_neither_printed_nor_left_in_a_file(
 ) -> None:
     """Against the counters of MuJoCo's own loop. A handler of the user's stays."""
     monkeypatch.chdir(tmp_path)
-    xml = f"""<mujoco><size memory="20K"/><option timestep="0.005"/><worldbody><geom type="plane" size="9 9 1"/>
-      <body pos="0 0 0.05">{JOINTS[kind]}</body></worldbody>
-      <actuator><motor name="push" joint="a" ctrlrange="-1 1"/></actuator></mujoco>"""
+    xml = scene(
+        f'<body pos="0 0 0.05">{JOINTS[kind]}</body>', motors("a", [1]), before='<size memory="20K"/>',
+        things='<geom type="plane" size="9 9 1"/>', option='timestep="0.005"',
+    )  # fmt: skip
     robot = MjcfRobot(scene_from_xml(xml, kind))
     plan = track(robot, np.zeros(len(robot.dynamics.state_coordinates)), np.zeros((6, 1)), 0.01, feedback=False)
     assert str(robot)
@@ -616,10 +613,7 @@ def test_contacts_are_those_of_the_whole_robot_whichever_body_disturbances_act_o
     found = []
     for order, body in [(1, None), (1, "p2"), (1, "q1"), (1, "q2"), (-1, None)]:
         path = tmp_path / "arms.xml"
-        path.write_text(
-            f"<mujoco><worldbody>{''.join(arms[::order] + balls)}</worldbody>"
-            '<actuator><motor joint="pa" ctrlrange="-1 1"/></actuator></mujoco>'
-        )
+        path.write_text(scene("".join(arms[::order] + balls), motors(["pa"], [1])))
         robot = MjcfRobot(path, body=body, position=())
         plan = track(robot, robot.at(), np.zeros((30, 1)), 0.02, feedback=False)
         run = simulate(Plant(robot, robot.scene), plan)

@@ -9,7 +9,7 @@ import pytest
 import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mechanisms import sled
+from mechanisms import arm, row, sled
 from sampling import examples, rarely
 
 import lqrsim as ls
@@ -31,19 +31,20 @@ from lqrsim.solvers.contact_modes import (
 
 H, DT, STEPS = 0.005, 0.02, 12  # s; a physics step, a control period, and how many of these
 # A slide that a motor pushes to its limit at 1 m, and a ball over the floor.
-SLIDE = sled(
-    joint='range="-1 1"', geom='size="0.1" mass="MASS"', actuators='<motor joint="x" gear="50" ctrlrange="-1 1"/>',
-    option='timestep="0.005" gravity="0 0 0" tolerance="1e-14" integrator="INTEGRATOR"',
+OPTION, MOTOR = (
+    'timestep="0.005" tolerance="1e-14" integrator="INTEGRATOR"',
+    '<motor joint="x" gear="50" ctrlrange="-1 1"/>',
+)
+SLIDE = sled(joint='range="-1 1"', geom='size="0.1" mass="MASS"', actuators=MOTOR, option=f'{OPTION} gravity="0 0 0"')
+BALL = sled(
+    "z", names="x", place="0 0 0.1", geom='size="0.1" mass="MASS"', things='<geom type="plane" size="5 5 1"/>',
+    actuators=MOTOR, option=OPTION,
 )  # fmt: skip
-BALL = """<mujoco><option timestep="0.005" tolerance="1e-14" integrator="INTEGRATOR"/><compiler autolimits="true"/>
-  <worldbody><geom type="plane" size="5 5 1"/><body pos="0 0 0.1"><joint name="x" type="slide" axis="0 0 1"/>
-  <geom size="0.1" mass="MASS"/></body></worldbody><actuator><motor joint="x" gear="50" ctrlrange="-1 1"/></actuator>
-  </mujoco>"""
 # A pendulum that a motor swings, with a limit.
-SWING = """<mujoco><option timestep="0.005" tolerance="1e-14" integrator="INTEGRATOR"/>
-  <compiler autolimits="true" angle="radian"/><worldbody><body><joint name="x" axis="0 1 0" range="-4 LIMIT"/>
-  <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.03" mass="MASS"/></body></worldbody>
-  <actuator><motor joint="x" gear="10" ctrlrange="-1 1"/></actuator></mujoco>"""
+SWING = arm(
+    0.5, along=(0, 0, -1), names="x", joint='axis="0 1 0" range="-4 LIMIT"', geom='size="0.03" mass="MASS"',
+    actuators='<motor joint="x" gear="10" ctrlrange="-1 1"/>', option=OPTION,
+)  # fmt: skip
 FILES = {"slide": SLIDE, "ball": BALL}
 GRAVITY = {"slide": 0.0, "ball": 9.81}
 MASSES, SPEEDS = st.floats(0.5, 3.0), st.floats(0.2, 2.0)
@@ -80,13 +81,13 @@ def test_a_period_is_that_of_the_dynamics_and_its_first_switch_the_distance(
 @settings(max_examples=examples(6))
 @given(st.lists(st.sampled_from([-1.01, 0.5, 1.01]), min_size=2, max_size=3))
 def test_switches_of_limits_have_the_same_names_with_sparse_jacobians(positions: list[float]) -> None:
-    slide = '<body pos="0 {0} 0"><joint name="{0}" type="slide" axis="1 0 0" range="-1 1"/><geom size="0.1"/></body>'
-    bodies = "".join(map(slide.format, range(len(positions))))
-    tendon = "".join(f'<joint joint="{k}" coef="1"/>' for k in range(len(positions)))
+    names = "abc"[: len(positions)]
+    coupled = "".join(f'<joint joint="{name}" coef="1"/>' for name in names)
+    tendon = f'<tendon><fixed range="-0.4 0.4">{coupled}</fixed></tendon>'
     found: list[Switches] = []
     for jacobian in ("dense", "sparse"):
-        text = f"""<mujoco><compiler autolimits="true"/><option gravity="0 0 0" jacobian="{jacobian}"/>
-          <worldbody>{bodies}</worldbody><tendon><fixed range="-0.4 0.4">{tendon}</fixed></tendon></mujoco>"""
+        option = f'gravity="0 0 0" jacobian="{jacobian}"'
+        text = row(names, joint='type="slide" axis="1 0 0" range="-1 1"', more=tendon, option=option)
         modes = ContactModes(mujoco.MjModel.from_xml_string(text), 2)
         found.append(modes.step(np.concatenate([positions, np.zeros(len(positions))]), np.zeros(0))[1])
     np.testing.assert_array_equal(found[0].names, found[1].names)

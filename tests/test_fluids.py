@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mechanisms import sled
+from mechanisms import motors, sled
 from sampling import examples
 from tracking import track
 
@@ -67,21 +67,14 @@ def test_a_sphere_drifts_in_oil_by_stokes(tmp_path: Path, stream: float, viscosi
     np.testing.assert_allclose(states[:, 1], expected, rtol=0, atol=1e-9)  # of RK4
 
 
-ARM = """
-<mujoco>
-  <option density="1000" viscosity="0.01" timestep="0.005" wind="0.1 0 0" integrator="implicitfast"/>
-  <worldbody>
-    <body name="hull">
-      <freejoint/><geom type="ellipsoid" size="0.3 0.2 0.1" mass="20" fluidshape="ellipsoid"/><site name="thruster"/>
-      <body name="arm" pos="0.3 0 0">
-        <joint name="elbow" axis="0 1 0" damping="0.5"/>
-        <geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.03" mass="1"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator><motor name="bend" joint="elbow"/><general name="thrust" site="thruster" gear="1 0 0 0 0 0"/></actuator>
-</mujoco>
-"""
+ARM = sled(
+    "", geom='type="ellipsoid" size="0.3 0.2 0.1" mass="20" fluidshape="ellipsoid"',
+    carried="""<freejoint/><site name="thruster"/>
+      <body name="arm" pos="0.3 0 0"><joint name="elbow" axis="0 1 0" damping="0.5"/>
+        <geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.03" mass="1"/></body>""",
+    actuators=motors(["elbow"]) + '<general name="thrust" site="thruster" gear="1 0 0 0 0 0"/>',
+    option='density="1000" viscosity="0.01" timestep="0.005" wind="0.1 0 0" integrator="implicitfast"',
+)  # fmt: skip
 
 
 @pytest.fixture

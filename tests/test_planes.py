@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
-from mechanisms import Jointed
+from mechanisms import Jointed, scene, sled
 from planar_quadrotor import BLOCK, PlanarQuadrotor, mjcf
 from sampling import examples
 from scipy.spatial.transform import Rotation
@@ -120,7 +120,7 @@ def test_a_world_that_is_cut_is_as_far_as_mujoco_says(seed: int, plane: str, off
         for one in world.obstacles
     )
     ball = '<body name="ball" mocap="true"><geom name="ball" size="0.01"/></body>'
-    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{geoms}{ball}</worldbody></mujoco>")
+    model = mujoco.MjModel.from_xml_string(scene(ball, things=geoms))
     data = mujoco.MjData(model)
     for place in rng.normal(size=(5, 2)) * 2:
         data.mocap_pos[0] = ways.in_world(place)
@@ -418,15 +418,11 @@ def test_a_robot_in_space_has_its_axes_in_order() -> None:
 
 def test_a_position_of_other_names_follows_the_remedy_into_order() -> None:
     """A ball on three slides, whose first is along y."""
-    text = """<mujoco><worldbody><body name="ball">
-      <joint name="a" type="slide" axis="0 1 0"/><joint name="b" type="slide" axis="1 0 0"/>
-      <joint name="c" type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body></worldbody>
-      <actuator><motor name="fa" joint="a"/><motor name="fb" joint="b"/><motor name="fc" joint="c"/></actuator>
-      </mujoco>"""
+    text = sled("yxz", name="ball", names="abc")
 
     class Ball(Jointed):
         name, body, radius = "ball", "ball", 0.1
-        joints, actuators = ("a", "b", "c"), ("fa", "fb", "fc")
+        joints = actuators = ("a", "b", "c")
         order: tuple[str, ...] = ("a", "b", "c")
 
         @property

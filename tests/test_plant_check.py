@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mechanisms import Jointed, sled
+from mechanisms import Jointed, scene, sled
 from planar_quadrotor import BLOCK, PlanarQuadrotor, mjcf
 from sampling import examples
 from tracking import track, weave
@@ -48,19 +48,13 @@ class Arm(Jointed):
         )
 
 
-def arm(things: str) -> ls.Scene:
-    return scene_from_xml(
-        f"""
-<mujoco><option timestep="0.005" integrator="RK4" gravity="0 0 -{GRAVITY}"/>
-  <worldbody>{things}
-    <body name="arm" pos="0 0 0.5"><joint name="shoulder" type="hinge" axis="0 -1 0"/>
+def arm(things: str = "", *, joint: str = "", motor: str = "", more: str = "") -> ls.Scene:
+    body = f"""<body name="arm" pos="0 0 0.5"><joint name="shoulder" axis="0 -1 0" {joint}/>
       <inertial pos="0 0 -{LENGTH}" mass="{MASS}" diaginertia="1e-9 1e-9 1e-9"/>
-      <geom name="fist" size="0.1" pos="0 0 -{LENGTH}"/></body>
-  </worldbody>
-  <actuator><motor name="motor" joint="shoulder"/></actuator>
-</mujoco>""",
-        "bench",
-    )
+      <geom name="fist" size="0.1" pos="0 0 -{LENGTH}"/></body>"""
+    option = f'timestep="0.005" integrator="RK4" gravity="0 0 -{GRAVITY}"'
+    driven = f'<motor name="motor" joint="shoulder" {motor}/>'
+    return scene_from_xml(scene(body, driven, things=things, option=option, more=more), "bench")
 
 
 POSTS = (
@@ -73,8 +67,7 @@ FLOOR = '<geom name="floor" type="plane" size="1 1 1" pos="0 0 0.05"/>'
 def test_an_arm_between_posts_and_on_a_floor_that_it_reaches_agrees(paired: tuple[str, ...]) -> None:
     """An obstacle of a pair would collide whatever its contype."""
     pairs = "".join(f'<pair geom1="fist" geom2="{obstacle}"/>' for obstacle in paired)
-    xml = arm(POSTS + FLOOR).xml.replace("</mujoco>", f"<contact>{pairs}</contact></mujoco>")
-    found = ls.check_plant(Arm(), scene_from_xml(xml, "bench"))
+    found = ls.check_plant(Arm(), arm(POSTS + FLOOR, more=f"<contact>{pairs}</contact>"))
     assert found.good, found
     assert found.contacts == ()
     assert not ls.check_plant(Arm(length=0.6), arm(POSTS + FLOOR)).good
@@ -98,9 +91,7 @@ def swung(**stated: Any) -> ls.Problem:
 @given(low=st.floats(-1.0, 0.2), high=st.floats(0.4, 1.5), most=st.floats(0.1, 2.0), seed=st.integers(0, 99))
 def test_samples_keep_to_the_bounds_of_a_problem(low: float, high: float, most: float, seed: int) -> None:
     """A stop of the joint, of which the dynamics know nothing, is outside of them; the change shows the controls."""
-    ends = f"{np.degrees(low - 0.15)} {np.degrees(high + 0.15)}"
-    stops = f'<joint name="shoulder" type="hinge" axis="0 -1 0" limited="true" range="{ends}"/>'
-    scene = scene_from_xml(arm("").xml.replace('<joint name="shoulder" type="hinge" axis="0 -1 0"/>', stops), "stops")
+    scene = arm(joint=f'range="{low - 0.15} {high + 0.15}"')
     bounds = [ls.StateBounds(angle=(low, high), speed=(-5.0, 5.0)), ls.StateBounds(speed=(-np.inf, 4.0))]
     problem = swung(constraints=bounds, control_limits=(-most, most))
     found = ls.check_plant(Arm(), scene, problem=problem, spread=3.0, seed=seed, samples=20)
@@ -179,12 +170,12 @@ def test_a_fast_wheel_hides_no_fault_of_the_cart(thrust: float, seed: int) -> No
 )  # fmt: skip
 def test_a_problem_that_does_not_fit_is_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ls.InputError, match=message):
-        ls.check_plant(Arm(), arm(""), **options)
+        ls.check_plant(Arm(), arm(), **options)
 
 
 def drawn(count: int, **options: Any) -> tuple[np.ndarray, np.ndarray]:
     """The states (k, 2) and controls (k, 1) of single samples."""
-    scene = arm("")
+    scene = arm()
     found = [ls.check_plant(Arm(), scene, seed=seed, samples=1, **options) for seed in range(count)]
     return np.array([one.state for one in found]), np.array([one.control for one in found])
 
@@ -219,8 +210,7 @@ def test_samples_are_about_a_plan() -> None:
 
 def test_a_plan_between_stops_agrees_near_it() -> None:
     """The dynamics do not know of the stops, which most of what is drawn by default is past."""
-    stops = '<joint name="shoulder" type="hinge" axis="0 -1 0" limited="true" range="-2 2"/>'
-    scene = scene_from_xml(arm("").xml.replace('<joint name="shoulder" type="hinge" axis="0 -1 0"/>', stops), "stops")
+    scene = arm(joint='range="-0.03 0.03"')
     plan = track(Arm(), (0.01, 0.0), np.zeros((50, 1)), 0.02)  # a pendulum's swing of 0.01 rad
     assert ls.check_plant(Arm(), scene, plan=plan).good
     assert not ls.check_plant(Arm(), scene).good
@@ -269,7 +259,7 @@ def test_wheels_stay_on_their_floor_and_their_contacts_are_said() -> None:
 
 def test_a_simulation_that_becomes_unstable_is_told() -> None:
     with pytest.raises(ls.InputError, match="scene bench: got a simulation that becomes unstable from x = "):
-        ls.check_plant(Arm(), arm(""), controls=((1e12,), (1e13,)))
+        ls.check_plant(Arm(), arm(), controls=((1e12,), (1e13,)))
 
 
 @pytest.mark.parametrize(
@@ -285,14 +275,9 @@ def test_a_simulation_that_becomes_unstable_is_told() -> None:
 def test_limits_that_an_actuator_cuts_off_are_refused(limited: str, got: str) -> None:
     """MuJoCo would cut the control off without a word, and what the rollout says was applied would not be so."""
     with pytest.raises(ls.InputError, match=f"robot arm: control_limits: {got}"):
-        ls.Plant(Arm(), motored(limited))
+        ls.Plant(Arm(), arm(motor=limited))
 
 
 @pytest.mark.parametrize("limited", ['ctrlrange="-3 3"', 'ctrlrange="-1 1" ctrllimited="false"'])
 def test_limits_that_actuators_let_through_are_accepted(limited: str) -> None:
-    ls.Plant(Arm(), motored(limited))
-
-
-def motored(limited: str) -> ls.Scene:
-    free = arm("")
-    return scene_from_xml(free.xml.replace('joint="shoulder"', f'joint="shoulder" {limited}'), "bench")
+    ls.Plant(Arm(), arm(motor=limited))

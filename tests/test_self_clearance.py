@@ -79,9 +79,9 @@ def drawn_tree(seed: int) -> str:
         geom = f'<geom name="g{k}" size="0.005" {rng.choice(kinds)}/>'
         inner[parents[k]] += f'<body name="b{k}" pos="{x} {y} {z}">{joint}{geom}{inner[k]}</body>'
     first, second, third, fourth = rng.permutation(7)[:4].tolist()
-    return f"""<mujoco><option gravity="0 0 0"/><worldbody>{inner[-1]}</worldbody>
-      <contact><exclude body1="b{first}" body2="b{second}"/><pair geom1="g{third}" geom2="g{fourth}"/></contact>
-      <actuator>{"".join(f'<motor joint="j{k}"/>' for k in joints)}</actuator></mujoco>"""
+    contact = f'<exclude body1="b{first}" body2="b{second}"/><pair geom1="g{third}" geom2="g{fourth}"/>'
+    driven, option = mechanisms.motors([f"j{k}" for k in joints]), 'gravity="0 0 0"'
+    return mechanisms.scene(inner[-1], driven, more=f"<contact>{contact}</contact>", option=option)
 
 
 @settings(max_examples=examples(60))

@@ -131,10 +131,12 @@ def sensordata(plant, states, controls, forces):
 
 
 # A puck between a floor and a wall, with rays along each axis and a camera with rays to both sides of the horizon.
-LOOKING = """<mujoco><worldbody><geom type="plane" size="0 0 1"/><geom type="box" size="0.1 1 2" pos="-2 0 0"/>
-  <body name="puck" pos="0 0 1"><joint name="x" type="slide" axis="1 0 0"/><geom size="0.1"/>{sites}
-    <camera name="eye" pos="0.2 0 0" xyaxes="0 -1 0 0 0 1" resolution="2 4"/></body></worldbody>
-  <actuator><motor joint="x"/></actuator><sensor>{sensors}</sensor></mujoco>"""
+LOOKING = sled(
+    name="puck", place="0 0 1",
+    carried='{sites}<camera name="eye" pos="0.2 0 0" xyaxes="0 -1 0 0 0 1" resolution="2 4"/>',
+    things='<geom type="plane" size="0 0 1"/><geom type="box" size="0.1 1 2" pos="-2 0 0"/>',
+    more="<sensor>{sensors}</sensor>",
+)  # fmt: skip
 DIRECTIONS = {"down": "0 0 -1", "up": "0 0 1", "back": "-1 0 0", "ahead": "1 0 0", "aside": "0 1 0"}
 FIELDS = ("dist", "dir", "origin", "point", "normal", "depth")
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from mechanisms import NO_CONTACT, arm, sled
 from sampling import examples, rarely
 
 import lqrsim as ls
@@ -18,20 +19,23 @@ from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers import budget, smoother, strategy
 from lqrsim.solvers.settings import SmootherSettings
 
-OPTION = '<option timestep="0.005" tolerance="1e-14"/><compiler autolimits="true"/>'
+OPTION, FLOOR = 'timestep="0.005" tolerance="1e-14"', '<geom type="plane" size="5 5 1"/>'
 # A ball over the floor, a leg of two joints that hops, a pendulum that hangs between stops.
-FALLING = f"""<mujoco>{OPTION}<default><geom solimp="SOLIMP"/></default><worldbody><geom type="plane" size="5 5 1"/>
-  <body pos="0 0 0.1"><joint name="z" type="slide" axis="0 0 1"/><geom type="sphere" size="0.1" mass="MASS"/></body>
-  </worldbody><actuator><motor joint="z" gear="10"/></actuator></mujoco>"""
-LEG = f"""<mujoco>{OPTION}<default><geom solimp="SOLIMP"/></default><worldbody><geom type="plane" size="5 5 1"/>
-  <body pos="0 0 0.6"><joint name="z" type="slide" axis="0 0 1"/><geom type="box" size="0.1 0.1 0.1" mass="MASS"/>
-  <body><joint name="leg" type="slide" axis="0 0 1" range="-0.15 0.15" damping="2" stiffness="200"/>
-  <geom type="sphere" pos="0 0 -0.5" size="0.05" mass="0.2"/></body></body>
-  </worldbody><actuator><motor joint="leg" gear="60" ctrlrange="-1 1"/></actuator></mujoco>"""
-STOPS = f"""<mujoco>{OPTION}<default><joint solimplimit="SOLIMP"/></default><worldbody><body>
-  <joint name="swing" axis="0 1 0" range="-60 60" damping="0.01"/><geom type="capsule" fromto="0 0 0 0 0 -0.5"
-  size="0.03" mass="MASS"/></body></worldbody><actuator><motor joint="swing" gear="5" ctrlrange="-1 1"/></actuator>
-  </mujoco>"""
+SOFT = {"before": '<default><geom solimp="SOLIMP"/></default>', "option": OPTION, "things": FLOOR}
+FALLING = sled(
+    "z", place="0 0 0.1", geom='size="0.1" mass="MASS"', actuators='<motor joint="z" gear="10"/>', **SOFT,
+)  # fmt: skip
+LEG = sled(
+    "z", place="0 0 0.6", geom='type="box" size="0.1 0.1 0.1" mass="MASS"',
+    carried="""<body><joint name="leg" type="slide" axis="0 0 1" range="-0.15 0.15" damping="2" stiffness="200"/>
+      <geom type="sphere" pos="0 0 -0.5" size="0.05" mass="0.2"/></body>""",
+    actuators='<motor joint="leg" gear="60" ctrlrange="-1 1"/>', **SOFT,
+)  # fmt: skip
+STOPS = arm(
+    0.5, along=(0, 0, -1), names=["swing"], geom='size="0.03" mass="MASS"',
+    joint=f'axis="0 1 0" range="{-np.pi / 3} {np.pi / 3}" damping="0.01" solimplimit="SOLIMP"',
+    actuators='<motor joint="swing" gear="5" ctrlrange="-1 1"/>', option=OPTION,
+)  # fmt: skip
 FILES = {"falling": FALLING, "leg": LEG, "stops": STOPS}
 # A state of each that touches, with its depth as the first argument, and its speed as the second.
 TOUCHING = {
@@ -198,14 +202,15 @@ def test_a_plan_that_does_not_converge_among_contacts_goes_on_through_softer_one
     ]
 
 
-SWIMMER = """<mujoco><option timestep="0.01" density="4000" viscosity="0.1" integrator="RK4"/>
-  <compiler autolimits="true"/><default><geom type="capsule" size="0.1" density="1000" contype="0" conaffinity="0"/>
-  <joint armature="0.1"/></default><worldbody><body><joint name="x" type="slide" axis="1 0 0"/>
-  <joint name="y" type="slide" axis="0 1 0"/><joint name="turn" axis="0 0 1"/><geom fromto="1.5 0 0 0.5 0 0"/>
-  <body pos="0.5 0 0"><geom fromto="0 0 0 -1 0 0"/><joint name="a" axis="0 0 1" range="-20 20"/>
-  <body pos="-1 0 0"><geom fromto="0 0 0 -1 0 0"/><joint name="b" axis="0 0 1" range="-20 20"/></body></body></body>
-  </worldbody><actuator><motor joint="a" gear="150" ctrlrange="-1 1"/><motor joint="b" gear="150" ctrlrange="-1 1"/>
-  </actuator></mujoco>"""
+TURN = f'axis="0 0 1" range="{-np.pi / 9} {np.pi / 9}"'
+SWIMMER = sled(
+    "xy", geom='fromto="1.5 0 0 0.5 0 0"', carried=f"""<joint name="turn" axis="0 0 1"/>
+      <body pos="0.5 0 0"><geom fromto="0 0 0 -1 0 0"/><joint name="a" {TURN}/>
+      <body pos="-1 0 0"><geom fromto="0 0 0 -1 0 0"/><joint name="b" {TURN}/></body></body>""",
+    before=f'<default><geom type="capsule" size="0.1" {NO_CONTACT}/><joint armature="0.1"/></default>',
+    actuators="".join(f'<motor joint="{name}" gear="150" ctrlrange="-1 1"/>' for name in "ab"),
+    option='timestep="0.01" density="4000" viscosity="0.1" integrator="RK4"',
+)  # fmt: skip
 
 
 @pytest.mark.long

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from mechanisms import row
 from sampling import examples
 
 import lqrsim as ls
@@ -87,16 +88,11 @@ def test_a_step_from_which_nothing_follows_is_named() -> None:
     assert solution.remedy == "use dt of at most 0.00103 s, with 98 times as many steps"
 
 
-CART = """
-<mujoco>
-  <option integrator="{integrator}" timestep="{timestep}"/>
-  <worldbody>
-    <body><joint name="x" type="slide" axis="1 0 0" damping="{damping}"/><geom size="0.1" mass="2"/></body>
-    <body pos="0 1 0"><joint name="turn" type="ball"/><geom size="0.1" pos="0.2 0 0"/></body>
-  </worldbody>
-  <actuator><motor name="push" joint="x"/><motor name="turn" joint="turn" gear="0 0 1"/></actuator>
-</mujoco>
-"""
+CART = row(
+    ("x", "turn"), joint="", joints=('type="slide" axis="1 0 0" damping="{damping}"', 'type="ball"'),
+    geoms=('mass="2"', 'pos="0.2 0 0"'), option='integrator="{integrator}" timestep="{timestep}"',
+    actuators='<motor name="push" joint="x"/><motor name="turn" joint="turn" gear="0 0 1"/>',
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("product", [0.99 * END, 1.01 * END, 3.7 * END])

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from export_c import CompiledLaw
+from mechanisms import NO_CONTACT, sled
 from sampling import rarely
 from scipy.spatial.transform import Rotation
 
@@ -28,10 +29,10 @@ def quadrotor() -> str:
         f'<motor name="m{name}" site="{name}" gear="0 0 1 0 0 {sign}0.1" ctrlrange="0 6"/>'
         for name, sign in zip(places, ("", "-", "", "-"), strict=True)
     )
-    return f"""<mujoco><option timestep="0.01" integrator="implicitfast"/><worldbody>
-      <body name="drone" pos="0 0 2"><freejoint/>{sites}
-        <geom type="box" size="0.1 0.1 0.02" mass="0.5" contype="0" conaffinity="0"/></body></worldbody>
-      <actuator>{motors}</actuator></mujoco>"""
+    return sled(
+        "", place="0 0 2", geom=f'type="box" size="0.1 0.1 0.02" mass="0.5" {NO_CONTACT}',
+        carried="<freejoint/>" + sites, actuators=motors, option='timestep="0.01" integrator="implicitfast"',
+    )  # fmt: skip
 
 
 def weightless() -> str:
@@ -40,9 +41,10 @@ def weightless() -> str:
         f'<motor name="m{i}" site="middle" gear="{" ".join(map(str, gear.tolist()))}" ctrlrange="-6 6"/>'
         for i, gear in enumerate(np.eye(6)[2:] * [1, 1, 1, 0.1, 0.1, 0.1])
     )
-    return f"""<mujoco><option timestep="0.01" integrator="implicitfast" gravity="0 0 0"/><worldbody>
-      <body name="body"><freejoint/><geom type="box" size="0.1 0.12 0.15" mass="0.5"/><site name="middle"/></body>
-      </worldbody><actuator>{motors}</actuator></mujoco>"""
+    return sled(
+        "", geom='type="box" size="0.1 0.12 0.15" mass="0.5"', carried='<freejoint/><site name="middle"/>',
+        actuators=motors, option='timestep="0.01" integrator="implicitfast" gravity="0 0 0"',
+    )  # fmt: skip
 
 
 FILES = {"quadrotor": quadrotor, "weightless": weightless}
