@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from linear_plans import by_hand
 from matplotlib.patches import Circle
+from mechanisms import NO_CONTACT, motors, scene
 from PIL import Image
 from planar_arm import HEIGHT, LENGTH, LINK, PlanarArm
 
@@ -171,18 +172,15 @@ def test_viewers_follow_its_last_ball(plant: ls.Plant, plan: ls.Solution, run: l
 @pytest.mark.parametrize("kind", ["turning", "folding"])
 def test_a_robot_with_neither_position_nor_balls_is_drawn_by_what_is_farthest_out(kind: str, tmp_path: Path) -> None:
     """A body on a ball joint, or two links that touch nothing; places by MuJoCo's kinematics of the recorded frames."""
-    flag = '<geom name="{}" type="capsule" fromto="{} 0 0 {} 0 0.1" size="0.03" contype="0" conaffinity="0"/>'
+    flag = f'<geom name="{{}}" type="capsule" fromto="{{}} 0 0 {{}} 0 0.1" size="0.03" {NO_CONTACT}/>'
     inner = {
         "turning": f'<joint name="turn" type="ball" damping="0.1"/>{flag.format("tip", 0.4, 0.6)}',
         "folding": f'<joint name="turn" axis="0 1 0"/>{flag.format("inner", 0, 0.3)}<body name="fore" pos="0.3 0 0">'
         f'<joint name="elbow" axis="0 1 0"/>{flag.format("tip", 0, 0.3)}</body>',
     }[kind]
-    scene = tmp_path / "scene.xml"
-    scene.write_text(
-        f"""<mujoco><worldbody><body name="hub">{inner}</body></worldbody>
-      <actuator><general joint="turn" gear="1 0.5 0.2"/></actuator></mujoco>"""
-    )
-    robot = ls.MjcfRobot(scene, outline=False)
+    file = tmp_path / "scene.xml"
+    file.write_text(scene(f'<body name="hub">{inner}</body>', '<general joint="turn" gear="1 0.5 0.2"/>'))
+    robot = ls.MjcfRobot(file, outline=False)
     assert robot.balls is None
     plant = ls.Plant(robot, robot.scene)
     states, dynamics, steps, dt = [robot.at()], robot.dynamics, 10, 0.02
@@ -233,23 +231,16 @@ def test_an_overview_has_all_of_an_arm_before_a_light_sky_and_no_hulls(
     """Red is what is drawn of the arm, blue the hull that collides, larger; the ball that is followed is low."""
     corners = "-1 -1 -1  1 -1 -1  0 1 -1  0 0 1"
     path = tmp_path / "tall.xml"
-    path.write_text(f"""
-<mujoco model="tall">
-  <compiler autolimits="true"/>
-  <asset>
-    <mesh name="hull" vertex="{corners}" scale=".12 .12 .12"/><mesh name="drawn" vertex="{corners}" scale=".1 .1 .1"/>
-  </asset>
-  <worldbody>{own}
-    <body name="mast">
-      <joint name="turn" axis="0 0 1" range="-90 90" damping="1"/>
-      <geom type="mesh" mesh="drawn" pos="0.3 0 1.5" rgba="1 0 0 1" contype="0" conaffinity="0"/>
+    mast = f"""<body name="mast"><joint name="turn" axis="0 0 1" range="-1.5 1.5" damping="1"/>
+      <geom type="mesh" mesh="drawn" pos="0.3 0 1.5" rgba="1 0 0 1" {NO_CONTACT}/>
       <geom type="mesh" mesh="hull" pos="0.3 0 1.5" rgba="0 0 1 1"/>
-      <geom type="cylinder" fromto="0 0 0 0.3 0 1.5" size="0.02" rgba="1 0 0 1" contype="0" conaffinity="0"/>
-      <geom type="sphere" size="0.05" pos="0.3 0 0" rgba="1 0 0 1"/>
-    </body>
-  </worldbody>
-  <actuator><motor joint="turn" ctrlrange="-5 5"/></actuator>
-</mujoco>""")
+      <geom type="cylinder" fromto="0 0 0 0.3 0 1.5" size="0.02" rgba="1 0 0 1" {NO_CONTACT}/>
+      <geom type="sphere" size="0.05" pos="0.3 0 0" rgba="1 0 0 1"/></body>"""
+    meshes = "".join(
+        f'<mesh name="{name}" vertex="{corners}" scale="{size} {size} {size}"/>'
+        for name, size in (("hull", 0.12), ("drawn", 0.1))
+    )
+    path.write_text(scene(mast, motors(["turn"], [5]), things=own, before=f"<asset>{meshes}</asset>"))
     robot = ls.MjcfRobot(path)
     problem = robot.problem(robot.at(), robot.at(turn=1.0), steps=20, dt=0.02)
     run = ls.simulate(ls.Plant(robot, robot.scene), ls.smooth(problem, max_iterations=1))

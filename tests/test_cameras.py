@@ -6,6 +6,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import av
+import mechanisms
 import mujoco
 import numpy as np
 import pytest
@@ -46,7 +47,7 @@ def test_projection_is_where_mujoco_draws(kind: str, size: tuple[int, int], roll
         for (x, y), far in zip(across, depth, strict=True)
     ]
     model = mujoco.MjModel.from_xml_string(
-        '<mujoco><visual><quality offsamples="0"/></visual><worldbody><body/></worldbody></mujoco>'
+        mechanisms.scene("<body/>", before='<visual><quality offsamples="0"/></visual>')
     )
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -224,25 +225,18 @@ def test_mark_is_seen_where_the_robot_is_whatever_hides_it(kind: str, rollout: l
             np.testing.assert_allclose(seen, camera.project(centre, size), rtol=0, atol=0.3)
 
 
-ARMED = """<mujoco><option timestep="0.01"/><worldbody>
-  <geom name="floor" type="plane" size="5 5 0.1"/>
-  <geom name="post" type="cylinder" size="0.1 0.5" pos="4 3 0.5"/>
-  <body name="base" pos="0 0 0.2">
-    <joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
-    <geom type="{kind}" size="{sizes}" mass="5" euler="{turn}"/>
-    <body name="arm" pos="0 0 0.1"><joint name="turn" axis="0 0 1"/>
-      <geom type="capsule" fromto="0 0 0.05 {reach} 0 0.05" size="0.02" mass="0.1"/></body>
-  </body></worldbody>
-  <actuator><motor joint="x"/><motor joint="y"/><motor joint="turn"/></actuator></mujoco>"""
-
-
 @pytest.mark.parametrize(("kind", "sizes"), [("cylinder", "0.2 0.1"), ("box", "0.2 0.15 0.1"), ("sphere", "0.2")])
 @pytest.mark.parametrize("reach", [0.6, 1.5])
 @pytest.mark.parametrize("turn", ["0 0 0", "0 0 90"])
 def test_what_stands_for_a_robot_is_as_wide_as_its_base_and_not_as_its_arms_reach(
     kind: str, sizes: str, reach: float, turn: str, rollout: ls.Rollout
 ) -> None:
-    xml = ARMED.format(kind=kind, sizes=sizes, reach=reach, turn=turn)
+    capsule = f'<geom type="capsule" fromto="0 0 0.05 {reach} 0 0.05" size="0.02" mass="0.1"/>'
+    xml = mechanisms.sled(
+        "xy", name="base", place="0 0 0.2", geom=f'type="{kind}" size="{sizes}" mass="5" euler="{turn}"',
+        carried=f'<body name="arm" pos="0 0 0.1"><joint name="turn" axis="0 0 1"/>{capsule}</body>',
+        things='<geom type="plane" size="5 5 0.1"/><geom type="cylinder" size="0.1 0.5" pos="4 3 0.5"/>', compiler="",
+    )  # fmt: skip
     model = mujoco.MjModel.from_xml_string(xml)
     run = dataclasses.replace(rollout, radius=reach + 0.02)
     assert drawn_size(model, run, model.body("base").id) == pytest.approx(0.2, rel=1e-6)

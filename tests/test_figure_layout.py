@@ -15,6 +15,7 @@ from linear_plans import by_hand
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from mechanisms import NO_CONTACT, row
 from sampling import examples
 
 import lqrsim as ls
@@ -161,19 +162,11 @@ def test_rounding_errors_of_a_constant_are_not_seen(value: float, tmp_path: Path
     assert "+" not in figure.axes[0].get_ylabel()
 
 
-PUSHED = """
-<mujoco>
-  <worldbody>
-    <body name="hand"><joint name="x" type="slide" axis="1 0 0"/><geom size="0.1" mass="1"/></body>
-    <body name="crate" pos="1 0.5 0">
-      <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/>
-      <geom type="box" size="0.2 0.1 0.1" mass="1" contype="0" conaffinity="0"/>
-    </body>
-    <body name="stays" pos="2 0 0"><joint type="slide"/><geom size="0.1" mass="1"/></body>
-  </worldbody>
-  <actuator><motor joint="x"/></actuator>
-</mujoco>
-"""
+PUSHED = row(
+    ("hand", "crate", "stays"), joint='type="slide" axis="1 0 0"', geom=NO_CONTACT,
+    places=("0 0 0", "1 0.5 0", "2 0 0"), geoms=('size="0.1"', 'type="box" size="0.2 0.1 0.1"', 'size="0.1"'),
+    carried=("", '<joint type="slide" axis="0 1 0"/>', ""), actuators='<motor joint="hand"/>',
+)  # fmt: skip
 
 
 def test_what_a_run_moved_is_drawn_where_it_was(tmp_path: Path) -> None:

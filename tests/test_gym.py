@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import mjcf_files
 import mujoco
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from mjcf_files import arm, cart
+from mechanisms import arm
 from PIL import Image
 from sampling import rarely
 
@@ -252,7 +253,7 @@ def test_wrong_environments_are_refused(drive_solution: ls.Solution, quadrotor_s
 
 def test_any_mjcf_and_any_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("cart.xml").write_text(f"<mujoco>{cart(np.random.default_rng(0))}</mujoco>", encoding="utf-8")
+    Path("cart.xml").write_text(mjcf_files.draw("cart", 0).xml, encoding="utf-8")
     Path("mine.py").write_text(
         "import lqrsim as ls\n\ndef push(steps=20):\n    return ls.scenarios.mjcf('cart.xml', steps=steps)\n",
         encoding="utf-8",
@@ -269,8 +270,8 @@ def test_any_mjcf_and_any_function(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_controls_without_limits_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "arm.xml"
-    path.write_text(f"<mujoco>{arm(np.random.default_rng(0))}</mujoco>", encoding="utf-8")
-    with pytest.raises(InputError, match=r"^scenario: got control bend within -inf to inf, want finite limits"):
+    path.write_text(arm(0.3), encoding="utf-8")
+    with pytest.raises(InputError, match=r"^scenario: got control a within -inf to inf, want finite limits"):
         lqrsim.gym.Environment(str(path))
 
 

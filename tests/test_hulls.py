@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mechanisms import scene
 from sampling import examples
 from scipy.optimize import lsq_linear
 from scipy.spatial import ConvexHull, QhullError
@@ -223,11 +224,12 @@ def test_distances_to_primitives_are_mujocos(kind: str) -> None:
     numbers = {name: " ".join(map(str, np.ravel(one))) for name, one in {
         "size": size if kind != "plane" else (1, 1, 1), "rock": rock, "turn": turn.as_quat(scalar_first=True),
     }.items()}  # fmt: skip
-    model = mujoco.MjModel.from_xml_string(
-        f"""<mujoco><asset><mesh name="rock" vertex="{numbers["rock"]}"/></asset><worldbody>
-        <geom type="{kind}" size="{numbers["size"]}" pos="0.1 0.2 0.3" quat="{numbers["turn"]}"/>
-        <body mocap="true"><geom type="mesh" mesh="rock"/></body></worldbody></mujoco>"""
+    xml = scene(
+        '<body mocap="true"><geom type="mesh" mesh="rock"/></body>',
+        before=f'<asset><mesh name="rock" vertex="{numbers["rock"]}"/></asset>',
+        things=f'<geom type="{kind}" size="{numbers["size"]}" pos="0.1 0.2 0.3" quat="{numbers["turn"]}"/>',
     )
+    model = mujoco.MjModel.from_xml_string(xml)
     data, apart = mujoco.MjData(model), 0
     for one in Rotation.random(60, rng=rng):
         data.mocap_pos[0], data.mocap_quat[0] = rng.normal(size=3) * 0.6, one.as_quat(scalar_first=True)

@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+from mechanisms import scene
 from scipy.spatial.transform import Rotation
 
 from lqrsim import robots
@@ -13,16 +14,11 @@ from lqrsim.scenes.scene import load_scene
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.plant_check import check_plant
 
-OPEN_FLOOR = """<mujoco>
-  <include file="create.xml"/>
-  <worldbody><geom name="floor" type="plane" size="5 5 0.1"/></worldbody>
-</mujoco>"""
-
 
 @pytest.fixture
 def open_floor(tmp_path):
     path = tmp_path / "open_floor.xml"
-    path.write_text(OPEN_FLOOR)
+    path.write_text(scene('<geom name="floor" type="plane" size="5 5 0.1"/>', before='<include file="create.xml"/>'))
     return Plant(DifferentialDrive(), load_scene(path))
 
 

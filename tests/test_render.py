@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 from funnels_by_hand import funnel_by_hand
+from mechanisms import motors, scene, sled
 from PIL import Image, ImageSequence
 from sampling import rarely
 from tracking import hover, track
@@ -61,12 +62,12 @@ def decode(path: Path) -> list[np.ndarray]:
         return [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
 
 
-LOFT = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><light pos="0 0 3"/>
-  <body pos="0 0 .3" euler="20 40 60"><geom name="beam" type="box" size=".1 .2 .3" pos=".6 .1 0"/></body>
-  <geom name="cone" type="ellipsoid" size=".2 .1 .1" pos="-.5 .4 .1" euler="0 0 30"/>
-  <body name="cart"><joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
-    <joint name="turn" axis="0 0 1"/><geom name="cart" type="box" size=".1 .05 .05" mass="1"/></body>
-</worldbody><actuator><motor joint="x"/><motor joint="y"/><motor joint="turn"/></actuator></mujoco>"""
+LOFT = sled(
+    "xy", name="cart", geom='type="box" size=".1 .05 .05" mass="1"', carried='<joint name="turn" axis="0 0 1"/>',
+    things="""<light pos="0 0 3"/><geom name="cone" type="ellipsoid" size=".2 .1 .1" pos="-.5 .4 .1" euler="0 0 30"/>
+      <body pos="0 0 .3" euler="20 40 60"><geom name="beam" type="box" size=".1 .2 .3" pos=".6 .1 0"/></body>""",
+    actuators=motors(("x", "y", "turn")), compiler="",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -243,11 +244,6 @@ def test_many_disturbances_do_not_fill_a_small_picture(
         assert image.size == (480, 270)
 
 
-POINT = """<mujoco><option timestep="0.02" gravity="0 0 0"/><worldbody><body name="point">
-    <joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>{}</body></worldbody>
-  <actuator><motor joint="x" ctrlrange="-2 2"/><motor joint="y" ctrlrange="-2 2"/></actuator></mujoco>"""
-
-
 @draws
 @pytest.mark.parametrize(
     "body",
@@ -260,7 +256,10 @@ POINT = """<mujoco><option timestep="0.02" gravity="0 0 0"/><worldbody><body nam
 @pytest.mark.filterwarnings("error")
 def test_a_robot_without_a_radius_is_drawn_and_measured(body: str, tmp_path: Path) -> None:
     """A point for the plan, it is as wide in pictures as its body, or as a point that can be seen."""
-    (tmp_path / "point.xml").write_text(POINT.format(body))
+    slides = '<joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>'
+    option = 'timestep="0.02" gravity="0 0 0"'
+    text = scene(f'<body name="point">{slides}{body}</body>', motors("xy", (2, 2)), option=option)
+    (tmp_path / "point.xml").write_text(text)
     robot = ls.MjcfRobot(str(tmp_path / "point.xml"), body="point", radius=0.0)
     solution = track(robot, np.zeros(4), np.full((20, 2), 1.0), 0.02)
     push = Push((0.1, 0.0, 0.0), at=0.1)
@@ -667,13 +666,9 @@ def test_import_leaves_the_environment_alone() -> None:
 def test_a_rope_is_drawn_between_its_sites(tmp_path: Path) -> None:
     """In a picture's pose its points are those of MuJoCo's own forward kinematics."""
     path = tmp_path / "pendulum.xml"
-    path.write_text(
-        """<mujoco><worldbody><site name="top" pos="0 0 1"/><body><joint name="x" type="slide" axis="1 0 0"/>
-        <geom size="0.1"/><site name="eye"/></body></worldbody>
-        <tendon><spatial name="rope"><site site="top"/><site site="eye"/></spatial></tendon>
-        <actuator><motor joint="x"/></actuator></mujoco>""",
-        encoding="utf-8",
-    )
+    rope = '<tendon><spatial name="rope"><site site="top"/><site site="eye"/></spatial></tendon>'
+    text = sled(geom='size="0.1"', carried='<site name="eye"/>', things='<site name="top" pos="0 0 1"/>', more=rope)
+    path.write_text(text, encoding="utf-8")
     robot = ls.MjcfRobot(path)
     run = ls.simulate(ls.Plant(robot, robot.scene), track(robot, robot.at(), np.full((30, 1), 30.0), 0.01))
     recorded = RecordedTrial(run, 0)

@@ -6,6 +6,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from mechanisms import motors, row
+from mechanisms import scene as mjcf
 from scipy.spatial.transform import Rotation
 
 from lqrsim.errors import InputError
@@ -26,7 +28,7 @@ def scene_of(tmp_path):
 
     def load(body="", *, text=None):
         path = tmp_path / "mine.xml"
-        path.write_text(text or f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+        path.write_text(text or mjcf(body, compiler=""))
         return load_scene(path)
 
     return load
@@ -70,11 +72,11 @@ def test_distances_in_the_cage_are_those_of_twelve_infinite_bars_and_a_cube():
 
 
 def test_without_contacts_nothing_is_an_obstacle(scene_of):
-    body = '<worldbody><geom name="post" size="0.1"/></worldbody>'
-    assert scene_of(text=f"<mujoco>{body}</mujoco>").world.names == ("post",)
+    body = '<geom name="post" size="0.1"/>'
+    assert scene_of(body).world.names == ("post",)
     for flag in ("contact", "constraint"):
         off = f'<option><flag {flag}="disable"/></option>'
-        assert scene_of(text=f"<mujoco>{off}{body}</mujoco>").world.names == ()
+        assert scene_of(text=mjcf(body, before=off)).world.names == ()
 
 
 @pytest.mark.parametrize("name", names())
@@ -159,7 +161,7 @@ def test_a_bar_behind_a_wall_is_nothing_before_it(scene_of, kind, seed):
     ],
 )
 def test_an_obstacle_without_a_distance_is_refused_by_name(scene_of, asset, geom, kind):
-    text = f"<mujoco><asset>{asset}</asset><worldbody>{geom}</worldbody></mujoco>"
+    text = mjcf(geom, before=f"<asset>{asset}</asset>")
     with pytest.raises(InputError, match=f"^scene mine: got the obstacle 'egg' of type {kind}, want one of: plane"):
         scene_of(text=text)
     drawn = scene_of(text=text.replace('name="egg"', 'name="egg" contype="0" conaffinity="0"'))
@@ -170,8 +172,8 @@ def test_a_mesh_is_its_convex_hull(scene_of):
     """Of a star without its inner corners, in MuJoCo's place; to the precision of single numbers in meshes."""
     star = "0 0 .9  .1 .1 .1  .8 0 0  -.1 .1 0  0 .7 0  -.6 0 0  0 -.5 0  0 0 -.4"
     geom = '<geom name="star" type="mesh" mesh="star" pos="1 2 3" euler="10 20 30"/>'
-    mesh = f'<mesh name="star" vertex="{star}"/>'
-    scene = scene_of(text=f"<mujoco><asset>{mesh}</asset><worldbody>{geom}</worldbody></mujoco>")
+    asset = f'<asset><mesh name="star" vertex="{star}"/></asset>'
+    scene = scene_of(text=mjcf(geom, before=asset, compiler=""))
     (obstacle,) = scene.world.obstacles
     spikes = np.array(star.split(), dtype=float).reshape(-1, 3)[[0, 2, 4, 5, 6, 7]]
     expected = Rotation.from_euler("XYZ", [10, 20, 30], degrees=True).apply(spikes) + np.array([1, 2, 3])
@@ -184,25 +186,20 @@ def test_a_mesh_is_its_convex_hull(scene_of):
 
 
 def test_a_scene_of_ones_own_includes_the_packaged_robots_and_files_beside_it(tmp_path):
-    (tmp_path / "rocks.xml").write_text(
-        '<mujoco><worldbody><geom name="rock" type="sphere" size=".2"/></worldbody></mujoco>'
-    )
+    (tmp_path / "rocks.xml").write_text(mjcf('<geom name="rock" type="sphere" size=".2"/>'))
     (tmp_path / "tetra.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
     path = tmp_path / "garden.xml"
-    path.write_text("""<mujoco>
-      <include file="quadrotor.xml"/>
-      <include file="rocks.xml"/>
-      <asset><mesh name="tetra" file="tetra.obj"/></asset>
-      <worldbody><geom type="mesh" mesh="tetra" contype="0" conaffinity="0"/></worldbody>
-    </mujoco>""")
+    included = """<include file="quadrotor.xml"/><include file="rocks.xml"/>
+      <asset><mesh name="tetra" file="tetra.obj"/></asset>"""
+    path.write_text(mjcf('<geom type="mesh" mesh="tetra" contype="0" conaffinity="0"/>', before=included))
     scene = load_scene(path)
     assert scene.world.names == ("rock",)
     assert mujoco.MjModel.from_xml_string(scene.xml).body("quadrotor").mass[0] == 0.5
 
 
 LOOK = '<mujoco><default><geom rgba="{0} 0 0 1"/></default></mujoco>'
-ARM = """<mujoco>{0}<asset>{1}</asset><worldbody><body name="arm"><joint name="turn"/>
-  <geom type="{2}"/></body></worldbody></mujoco>"""
+ARM = mjcf('<body name="arm"><joint name="turn"/><geom {2}/></body>', before="{0}<asset>{1}</asset>", compiler="")
+INCLUDING = mjcf("", motors(["turn"]), before='<include file="parts/arm.xml"/>', compiler="")
 
 
 @pytest.mark.parametrize("here", [("look.xml", "parts/look.xml"), ("parts/look.xml",)], ids=["main first", "nested"])
@@ -211,12 +208,12 @@ def test_includes_are_found_where_mujoco_finds_them(here, tmp_path):
     (tmp_path / "parts" / "more").mkdir(parents=True)
     for number, name in enumerate(here, 1):
         (tmp_path / name).write_text(LOOK.format(number / 4))
-    arm = ARM.format('<include file="look.xml"/><include file="more/empty.xml"/>', "", 'sphere" size=".1')
+    arm = ARM.format('<include file="look.xml"/><include file="more/empty.xml"/>', "", 'size=".1"')
     (tmp_path / "parts" / "arm.xml").write_text(arm)
     (tmp_path / "parts" / "more" / "empty.xml").write_text('<mujoco><include file="deep.xml"/></mujoco>')
     (tmp_path / "parts" / "more" / "deep.xml").write_text('<mujoco><option timestep="0.007"/></mujoco>')
     path = tmp_path / "scene.xml"
-    path.write_text('<mujoco><include file="parts/arm.xml"/><actuator><motor joint="turn"/></actuator></mujoco>')
+    path.write_text(INCLUDING)
     model, wanted = MjcfRobot(path).scene.model, mujoco.MjModel.from_xml_path(str(path))
     np.testing.assert_array_equal(model.geom_rgba, wanted.geom_rgba)
     assert wanted.geom_rgba[0, 0] == 0.25
@@ -235,10 +232,10 @@ def test_meshes_and_models_of_an_included_file_are_found_where_mujoco_finds_them
         (meshes / "claw.obj").write_text(TETRA.format(0.3))
     compiler = f'<compiler meshdir="{folder}"/>' if folder else ""
     assets = '<mesh name="claw" file="claw.obj"/><model name="hand" file="hand.xml"/>'
-    arm = ARM.format(compiler, assets, 'mesh" mesh="claw')
+    arm = ARM.format(compiler, assets, 'type="mesh" mesh="claw"')
     (parts / "arm.xml").write_text(arm.replace("</body>", '<attach model="hand" body="hand" prefix="left_"/></body>'))
     path = tmp_path / "scene.xml"
-    path.write_text('<mujoco><include file="parts/arm.xml"/><actuator><motor joint="turn"/></actuator></mujoco>')
+    path.write_text(INCLUDING)
     model, wanted = load_scene(path).model, mujoco.MjModel.from_xml_path(str(path))
     np.testing.assert_array_equal(model.mesh_vert, wanted.mesh_vert)
     np.testing.assert_array_equal(model.geom_size, wanted.geom_size)
@@ -253,17 +250,27 @@ def test_meshes_are_in_the_folder_that_was_set_last(own, first, second, tmp_path
         (tmp_path / folder).mkdir(exist_ok=True)
         (tmp_path / folder / "claw.obj").write_text(TETRA.format(number / 10))
     compilers = f"<compiler {first}/><compiler {second}/>"
-    arm = ARM.format(compilers, '<mesh name="claw" file="claw.obj"/>', 'mesh" mesh="claw')
+    arm = ARM.format(compilers, '<mesh name="claw" file="claw.obj"/>', 'type="mesh" mesh="claw"')
     (tmp_path / "parts" / "arm.xml").write_text(arm)
-    path, actuator = tmp_path / "scene.xml", '<actuator><motor joint="turn"/></actuator>'
-    path.write_text(f'<mujoco><compiler {own}/><include file="parts/arm.xml"/>{actuator}</mujoco>')
+    path = tmp_path / "scene.xml"
+    path.write_text(INCLUDING.replace("<compiler ", f"<compiler {own}"))
     model, wanted = load_scene(path).model, mujoco.MjModel.from_xml_path(str(path))
     np.testing.assert_array_equal(model.mesh_vert, wanted.mesh_vert)
 
 
-HAND = """<mujoco model="hand">{asset}<worldbody><body name="hand" pos=".5 0 0">
-  <joint name="grip" range="-40 40"/><geom name="palm" size="{size}"/>{geom}<site name="tip" pos=".1 0 0"/>
-</body></worldbody><actuator><position name="grip" joint="grip" kp="3"/></actuator></mujoco>"""
+HAND = mjcf(
+    """<body name="hand" pos=".5 0 0"><joint name="grip" range="-40 40"/><geom name="palm" size="{size}"/>{geom}
+    <site name="tip" pos=".1 0 0"/></body>""",
+    '<position name="grip" joint="grip" kp="3"/>',
+    before="{asset}",
+    compiler="",
+)
+HOLDING = mjcf(
+    """<body name="arm"><joint name="turn"/><geom size=".1"/>
+    <frame pos="0 0 .2"><attach model="hand" body="hand" prefix="left_"/></frame></body>""",
+    motors(["turn"]),
+    before='<asset><model name="hand" file="{}"/></asset>',
+)
 TETRA = "v 0 0 0\nv {0} 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
 
@@ -280,9 +287,7 @@ def test_an_attached_model_is_that_beside_the_file(where, meshed, tmp_path, monk
             (own / "claw.obj").write_text(TETRA.format(length))
     path = tmp_path / "robot" / "arm.xml"
     name = str(tmp_path / "robot" / "hand.xml") if where.startswith("/") else where
-    path.write_text(f"""<mujoco><asset><model name="hand" file="{name}"/></asset><worldbody><body name="arm">
-      <joint name="turn"/><geom size=".1"/><frame pos="0 0 .2"><attach model="hand" body="hand" prefix="left_"/></frame>
-    </body></worldbody><actuator><motor joint="turn"/></actuator></mujoco>""")
+    path.write_text(HOLDING.format(name))
     monkeypatch.chdir(tmp_path / "elsewhere")
     model, wanted = MjcfRobot(path).scene.model, mujoco.MjModel.from_xml_path(str(path))
     assert model.nq == 2
@@ -298,9 +303,7 @@ def test_an_attached_model_without_names_gets_some(unnamed, tmp_path):
     hand = hand.replace(f"<{unnamed}{name}", f"<{unnamed}").replace(' joint="grip"', ' site="tip"')
     (tmp_path / "hand.xml").write_text(hand)
     path = tmp_path / "arm.xml"
-    path.write_text("""<mujoco><asset><model name="hand" file="hand.xml"/></asset><worldbody><body name="arm">
-      <joint name="turn"/><geom size=".1"/><attach model="hand" body="hand" prefix="left_"/>
-    </body></worldbody><actuator><motor joint="turn"/></actuator></mujoco>""")
+    path.write_text(HOLDING.format("hand.xml"))
     model, kind = MjcfRobot(path).scene.model, "actuator" if unnamed == "position" else unnamed
     for one, count in (
         ("body", model.nbody),
@@ -320,19 +323,19 @@ def test_an_attached_model_without_names_gets_some(unnamed, tmp_path):
         ("<sdf/>", "^scene: got mine.xml with <sdf> at its root, want <mujoco>$"),
         ("<robot/>", r"^scene: got mine.xml, which is a URDF, want a name that ends in \.urdf; to be included it"),
         (
-            "<mujoco><worldbody><geom typ='box'/></worldbody></mujoco>",
+            mjcf("<geom typ='box'/>"),
             "^scene mine: got an MJCF that MuJoCo refuses: XML Error: Schema violation: unrecognized attribute: 'typ'",
         ),
         (
-            "<mujoco><worldbody><geom type='box' size='0 1 1'/></worldbody></mujoco>",
+            mjcf("<geom type='box' size='0 1 1'/>"),
             "^scene mine: got an MJCF that MuJoCo refuses: Error: size 0 must be positive in geom",
         ),
         (
-            '<mujoco><include file="crate.xml"/></mujoco>',
+            mjcf("", before='<include file="crate.xml"/>'),
             "^scene: got an include of 'crate.xml', want a file beside mine.xml or one of: arena.xml, cage.xml, create",
         ),
         (
-            '<mujoco><include file="create.xml"/><include file="create.xml"/></mujoco>',
+            mjcf("", before=2 * '<include file="create.xml"/>'),
             "^scene: got create.xml included twice in mine.xml, want each file once$",
         ),
     ],
@@ -344,20 +347,19 @@ def test_a_bad_file_is_told_in_one_line(scene_of, text, message):
 
 
 def test_a_file_with_nearly_that_name_is_offered(tmp_path: Path) -> None:
-    (tmp_path / "excavator.xml").write_text("<mujoco/>")
+    (tmp_path / "excavator.xml").write_text(mjcf(""))
     with pytest.raises(InputError, match=r"\(did you mean .*excavator\.xml\?\)$"):
         load_scene(tmp_path / "excavater.xml")
 
 
 @pytest.mark.skipif(mujoco.__version__ != "4.0.0", reason="the bug is in 4.0.0 alone")
 def test_a_sparse_model_is_refused_where_mujoco_solves_it_wrongly(scene_of):
-    text = '<mujoco><option jacobian="sparse"/><worldbody><body><joint/><geom size="1"/></body></worldbody></mujoco>'
     with pytest.raises(InputError, match=r"^scene mine: got a sparse constraint Jacobian, which MuJoCo 4.0.0"):
-        scene_of(text=text)
+        scene_of(text=row("a", option='jacobian="sparse"'))
 
 
 def test_elements_nested_by_the_thousand_get_one_line(tmp_path):
-    deep = "<mujoco><worldbody>" + "<body><geom size='1'/>" * 3000 + "</body>" * 3000 + "</worldbody></mujoco>"
+    deep = mjcf("<body><geom size='1'/>" * 3000 + "</body>" * 3000)
     (tmp_path / "deep.xml").write_text(deep)
     with pytest.raises(InputError, match=r"^scene deep: got elements nested deeper than 490"):
         scene_from_xml(deep, "deep")
@@ -370,18 +372,15 @@ def test_a_huge_height_field_gets_one_line(scene_of):
     with pytest.raises(
         InputError, match="got 100000 x 100000 heights in the height field 'land', want 16,777,216 at most"
     ):
-        scene_from_xml(f"<mujoco>{asset}<worldbody><geom size='1'/></worldbody></mujoco>", "hills")
+        scene_from_xml(mjcf("<geom size='1'/>", before=asset), "hills")
 
 
 def test_a_nan_in_the_file_gets_one_line_and_leaves_no_log(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    body = '<body><joint name="j"/><geom size="1"/></body>'
     with pytest.raises(
         InputError, match=r"^scene odd: got NaN in the MJCF \(MuJoCo's actuator_\w+\[0\]\), want numbers"
     ):
-        scene_from_xml(
-            f'<mujoco><worldbody>{body}</worldbody><actuator><motor joint="j" gear="nan"/></actuator></mujoco>', "odd"
-        )
+        scene_from_xml(row("j", actuators='<motor joint="j" gear="nan"/>'), "odd")
     assert not list(tmp_path.iterdir())
 
 
@@ -445,13 +444,13 @@ def test_names_that_obstacles_without_one_get_are_free(scene_of):
 )
 def test_what_mujoco_would_not_survive_or_not_say(text, message):
     with pytest.raises(InputError, match=f"^scene odd: got .*{message}|^scene odd: {message}"):
-        scene_from_xml(f"<mujoco><worldbody>{text}</worldbody></mujoco>", "odd")
+        scene_from_xml(mjcf(text), "odd")
 
 
 def test_replicas_are_obstacles_and_thousands_of_them_are_loaded_quickly():
     """In processor time, as a ratio: at most three times what MuJoCo needs by itself, in the best of five."""
-    text = '<mujoco><worldbody><light/><camera pos="0 0 1"/><replicate count="100" offset="1 0 0"><replicate count="50"'
-    text += ' offset="0 1 0"><geom type="box" size=".1 .1 .1"/></replicate></replicate></worldbody></mujoco>'
+    text = mjcf("""<light/><camera pos="0 0 1"/><replicate count="100" offset="1 0 0"><replicate count="50"
+      offset="0 1 0"><geom type="box" size=".1 .1 .1"/></replicate></replicate>""")
 
     def seconds(load):
         began = time.process_time()

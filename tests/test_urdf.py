@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mechanisms import scene
 from sampling import examples
 from scipy.spatial.transform import Rotation
 
@@ -502,19 +503,17 @@ def test_a_plant_of_it_agrees_with_it(arm: Path) -> None:
 def test_an_mjcf_includes_what_a_urdf_becomes(arm: Path) -> None:
     """With ground and obstacles: joints in radians, in a file that has another mass by its density."""
     arm.with_name("arm.xml").write_text(ls.load_scene(arm, base="free").xml, encoding="utf-8")
-    scene = arm.with_name("field.xml")
-    scene.write_text(
-        '<mujoco><include file="arm.xml"/><worldbody><geom name="ground" type="plane" size="5 5 .1"/>'
-        '<geom name="post" type="cylinder" size=".1 1" pos="2 0 1"/>'
-        '<body name="ball" pos="3 0 1"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>',
-        encoding="utf-8",
-    )
-    robot = ls.MjcfRobot(scene, body="base")
-    scene.with_name("wrong.xml").write_text('<mujoco><include file="arm.urdf"/></mujoco>', encoding="utf-8")
+    file = arm.with_name("field.xml")
+    things = """<geom name="ground" type="plane" size="5 5 .1"/>
+      <geom name="post" type="cylinder" size=".1 1" pos="2 0 1"/>
+      <body name="ball" pos="3 0 1"><freejoint/><geom size="0.1"/></body>"""
+    file.write_text(scene(things, before='<include file="arm.xml"/>'), encoding="utf-8")
+    robot = ls.MjcfRobot(file, body="base")
+    file.with_name("wrong.xml").write_text(scene("", before='<include file="arm.urdf"/>'), encoding="utf-8")
     with pytest.raises(
         InputError, match=r"^scene: got arm\.urdf, which is a URDF, want a name that ends in \.urdf; to be"
     ):
-        ls.load_scene(scene.with_name("wrong.xml"))
+        ls.load_scene(file.with_name("wrong.xml"))
     assert "post" in robot.scene.world.names
     assert robot.mjcf.joints[1].limits == (-2.0, 1.5)
     assert robot.scene.model.body("ball").mass[0] == pytest.approx(1000 * 4 / 3 * np.pi * 1e-3, rel=1e-12)

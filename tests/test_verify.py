@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mechanisms import motors, scene
 from sampling import examples, rarely
 from tracking import weave
 
@@ -418,12 +419,14 @@ def test_a_robot_without_position_or_balls_is_measured_by_a_geom_that_is_whole_i
 ) -> None:
     """Within a 60th of the radius, which the page promises, of the lens as MuJoCo places it."""
     mount, head, carried, drawn = FOLLOWED[kind]
-    (tmp_path / "scene.xml").write_text(f"""<mujoco><option timestep="0.005" gravity="0 0 0"/>{SOLID}<worldbody>
-      <geom name="table" type="box" size=".1 .1 .1" pos="0 0 -2"/>
-      <body name="mount"><joint name="pan" axis="0 0 1" damping=".1" armature=".01"/>
+    bodies = f"""<body name="mount"><joint name="pan" axis="0 0 1" damping=".1" armature=".01"/>
       <inertial pos="0 0 0" mass=".5" diaginertia=".01 .01 .01"/>{mount}
-      <body name="camera">{TILTING}{head}<body name="hung" pos="-.1 0 0">{carried}</body></body></body></worldbody>
-      <actuator><motor joint="pan"/><motor joint="tilt"/></actuator></mujoco>""")
+      <body name="camera">{TILTING}{head}<body name="hung" pos="-.1 0 0">{carried}</body></body></body>"""
+    text = scene(
+        bodies, motors(("pan", "tilt")), things='<geom name="table" type="box" size=".1 .1 .1" pos="0 0 -2"/>',
+        before=SOLID, option='timestep="0.005" gravity="0 0 0"',
+    )  # fmt: skip
+    (tmp_path / "scene.xml").write_text(text)
     robot = ls.MjcfRobot(tmp_path / "scene.xml", body="mount", outline=False, radius=0.05)
     problem = robot.problem(robot.at(), robot.at(pan=0.6, tilt=0.4), steps=16)
     run = ls.simulate(ls.Plant(robot, robot.scene), ls.smooth(problem, max_iterations=3, starts=1), seed=0)
@@ -466,9 +469,7 @@ def test_the_middle_of_a_thin_mask_is_its_centre(
 def test_how_far_a_geom_reaches(kind: str, size: tuple[float, float, float], seed: int) -> None:
     """The largest product with a direction, over points of its surface that are found by MuJoCo's rays."""
     shape = " ".join(map(str, size[: {"sphere": 1, "capsule": 2, "cylinder": 2}.get(kind, 3)]))
-    model = mujoco.MjModel.from_xml_string(
-        f'<mujoco><worldbody><geom type="{kind}" size="{shape}"/></worldbody></mujoco>'
-    )
+    model = mujoco.MjModel.from_xml_string(scene(f'<geom type="{kind}" size="{shape}"/>'))
     data, rng = mujoco.MjData(model), np.random.default_rng(seed)
     mujoco.mj_forward(model, data)
     rays = rng.normal(size=(4000, 3))

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mechanisms import scene
 from sampling import examples
 from scipy.spatial.transform import Rotation
 
@@ -51,11 +52,9 @@ def test_distance_is_mujocos(kind: str) -> None:
     text = f'size="{" ".join(map(str, np.asarray(size)))}"' if kind != "mesh" else 'mesh="rock"'
     rock = " ".join(map(str, ROCK.ravel()))
     pose = f'pos="{" ".join(map(str, thing.position))}" quat="{" ".join(map(str, quaternion))}"'
-    model = mujoco.MjModel.from_xml_string(
-        f"""<mujoco><asset><mesh name="rock" vertex="{rock}"/></asset>
-        <worldbody><geom name="it" type="{kind}" {text} {pose}/>
-        <body name="ball" mocap="true"><geom name="ball" size="0.01"/></body></worldbody></mujoco>"""
-    )
+    ball, asset = '<body mocap="true"><geom size="0.01"/></body>', f'<asset><mesh name="rock" vertex="{rock}"/></asset>'
+    xml = scene(ball, things=f'<geom type="{kind}" {text} {pose}/>', before=asset)
+    model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     world, rng = ls.World([thing]), np.random.default_rng(1)
     for _ in range(50):
