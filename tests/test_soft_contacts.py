@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -21,7 +22,7 @@ from lqrsim.solvers.settings import SmootherSettings
 
 OPTION, FLOOR = 'timestep="0.005" tolerance="1e-14"', '<geom type="plane" size="5 5 1"/>'
 # A ball over the floor, a leg of two joints that hops, a pendulum that hangs between stops.
-SOFT = {"before": '<default><geom solimp="SOLIMP"/></default>', "option": OPTION, "things": FLOOR}
+SOFT: dict[str, Any] = {"before": '<default><geom solimp="SOLIMP"/></default>', "option": OPTION, "things": FLOOR}
 FALLING = sled(
     "z", place="0 0 0.1", geom='size="0.1" mass="MASS"', actuators='<motor joint="z" gear="10"/>', **SOFT,
 )  # fmt: skip

@@ -53,6 +53,7 @@ def arm(
     limits: Sequence[float] = (),
     actuators: str = "",
     before: str = "",
+    option: str = 'timestep="0.01" integrator="implicitfast"',
     **more: str,
 ) -> str:
     """Capsules in a line, each hinged to the end of the one before; `gap` is from a hinge to where its capsule begins.
@@ -70,9 +71,7 @@ def arm(
           <geom class="link" type="capsule" fromto="{at(gap)} {at(lengths[k])}" {geoms[k]}/>{bodies}</body>"""
     default = f'<default><default class="link"><joint {joint}/><geom {geom}/></default></default>'
     driven = actuators or motors(names[: len(lengths)], limits)
-    return scene(
-        bodies, driven, **{"option": 'timestep="0.01" integrator="implicitfast"', **more}, before=default + before
-    )
+    return scene(bodies, driven, before=default + before, option=option, **more)
 
 
 def sled(
@@ -86,6 +85,7 @@ def sled(
     carried: str = "",
     limits: Sequence[float] = (),
     actuators: str = "",
+    option: str = 'timestep="0.01" gravity="0 0 0"',
     **more: str,
 ) -> str:
     """A body, with a geom of the same name, that slides along these axes and carries others, or joints of its own.
@@ -98,7 +98,7 @@ def sled(
         for own, axis in zip(names, axes, strict=True)
     )
     body = f'<body name="{name}" pos="{place}">{slides}<geom name="{name}" {geom}/>{carried}</body>'
-    return scene(body, actuators or motors(names, limits), **{"option": 'timestep="0.01" gravity="0 0 0"', **more})
+    return scene(body, actuators or motors(names, limits), option=option, **more)
 
 
 def row(
