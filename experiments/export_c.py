@@ -83,7 +83,7 @@ class CompiledLaw(ls.Controller):
         number: str = "double",
         **options: Any,
     ) -> None:
-        self.policy, self.number = policy, number
+        self.policy, self.number, self.sees_losses = policy, number, isinstance(policy, OutputFeedbackPolicy)
         self.exported = ls.export_c(policy, folder, number=number, **options)
         (folder / "swap.c").write_text(SWAP, encoding="utf-8")
         source, library = folder / "swap.c", folder / "policy.so"
@@ -125,22 +125,22 @@ class CompiledLaw(ls.Controller):
 
 class _Run(ls.types.ControllerRun):
     def __init__(self, law: CompiledLaw, trials: int) -> None:
-        self._law, self._last = law, np.full((trials, len(law.policy.state_coordinates)), np.nan)
+        self._law, self.shown = law, list[Array]()  # (K, n) each
         self._filters = isinstance(law.policy, OutputFeedbackPolicy)
         self._z = np.tile(law.policy.nominal[0], (trials, 1)).astype(REAL[law.number])
         self._chosen = OutputFeedback(law.policy).measures if isinstance(law.policy, OutputFeedbackPolicy) else []
 
     def control(self, step: int, measured: Array) -> Array:
         law, commands = self._law, []
-        for k, (shown, last) in enumerate(zip(measured, self._last, strict=True)):
+        self.shown.append(measured.copy())
+        for k, shown in enumerate(measured):
             if not self._filters:
                 commands.append(law(shown, step * law.policy.dt))
                 continue
             law.swap(self._z[k])
-            lost = np.array_equal(shown, last)
+            lost = np.isnan(shown).all()
             commands.append(law(None if lost else shown[self._chosen], step * law.policy.dt))
             law.swap(self._z[k])
-        self._last[:] = measured
         return np.array(commands)
 
 
@@ -197,9 +197,10 @@ def campaign(config: Config) -> list[Result]:
 def difference(rollout: ls.Rollout, policy: Any, solution: ls.Solution) -> float:
     """The largest difference between a run's commands and those of the law in Python for the same measurements."""
     whole = np.isfinite(rollout.commanded).all(axis=(1, 2)) & np.isfinite(rollout.measured).all(axis=(1, 2))
-    measured, commanded = rollout.measured[whole], rollout.commanded[whole]
-    again = as_controller(policy, solution, None)[0].start(len(measured))  # type: ignore[arg-type] - not of a function
-    commands = [again.control(step, measured[:, step]) for step in range(commanded.shape[1])]
+    commanded = rollout.commanded[whole]
+    again = as_controller(policy, solution, None)[0].start(len(commanded))  # type: ignore[arg-type] - not of a function
+    assert isinstance(rollout.controller_run, _Run)
+    commands = [again.control(step, shown[whole]) for step, shown in enumerate(rollout.controller_run.shown)]
     return float(np.abs(commanded - np.array(commands).swapaxes(0, 1)).max())
 
 
@@ -272,9 +273,9 @@ def board(config: Config) -> list[Result]:
 def on_board(law: CompiledLaw, rollout: ls.Rollout, solution: ls.Solution, folder: Path) -> Result:
     """What the law takes on the emulated board along a run, and its commands beside the host's and Python's."""
     measured, commanded = rollout.measured[0, :-1].astype(np.float32), rollout.commanded[0]
-    lost = np.zeros(len(measured), dtype=int)
+    assert isinstance(rollout.controller_run, _Run)
+    lost = np.isnan(rollout.controller_run.shown).all(axis=2)[:, 0].astype(int)
     if isinstance(law.policy, OutputFeedbackPolicy):
-        lost[1:] = (measured[1:] == measured[:-1]).all(axis=1)
         measured = measured[:, OutputFeedback(law.policy).measures]
     rows = ",\n".join("{" + ", ".join(f"{value!s}f" for value in row) + "}" for row in measured)
     (folder / "board.c").write_text(BOARD % (rows, ", ".join(map(str, lost))), encoding="utf-8")

@@ -20,7 +20,7 @@ import math
 import os
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Annotated, Any, Self
@@ -40,6 +40,7 @@ from lqrsim.results.solution import Plan
 LOST_AFTER = 3  # control periods without a state after which the controller stops
 KEPT = 10  # commands that a reader keeps until they are received
 WAIT_SLICE = 0.05  # s, the interval at which a wait checks for signals
+ANSWERS = "answers "  # begins the label of a command; the rest is the stamp of the state that it answers
 AXES = "xyz"
 # The states in an Odometry message, by name: velocities along the world's axes, rates along the body's.
 ODOMETRY = ("x", "y", "z", "vx", "vy", "vz", "rx", "ry", "rz", "wx", "wy", "wz", "heading")
@@ -137,16 +138,18 @@ def run(
             while not lockstep and (left := due - time.monotonic()) > 0:
                 time.sleep(left)
             began = time.monotonic()
-            held += not inlet.receive() and step > 0
+            some_new, all_new = inlet.receive()
+            held += not all_new and step > 0
             if (age := began - inlet.arrived) > longest:
                 reason = f"no state for {age:.3g} s, after {step} periods"
                 break
-            command = running.control(step, inlet.state[None])[0]
+            lost = controller.sees_losses and not some_new and step > 0
+            command = running.control(step, np.full((1, len(states)), np.nan) if lost else inlet.state[None])[0]
             diverged = running.estimator_diverged()
             if diverged or not np.isfinite(command).all():
                 reason = diverged.get(0, f"got {excerpt(command.tolist())} from the controller")
                 break
-            outlet.write(node.numbers(command))
+            outlet.write(node.numbers(command, _label_of(inlet.messages.values())))
             response.append(time.monotonic() - began)
             late.append(0.0 if lockstep else began - due)
             sent.append(command)
@@ -167,9 +170,10 @@ class SimulatedRobot:
             rollout = ls.simulate(plant, solution, controller=robot)
         print(robot.summary())
 
-    It publishes the measured state of each control period and waits for a command. With a bridge in lockstep, the
+    It publishes the measured state of each control period and waits for its command. With a bridge in lockstep, the
     simulation runs as fast as both programs allow. With a bridge that runs by a clock, it runs as fast as the clock.
-    A simulation that falls behind skips the commands that arrived meanwhile.
+    A simulation that falls behind skips the commands that arrived meanwhile, and those that are labelled as answers to
+    earlier states. A measurement that gets lost is published as NaN, which a bridge does not use.
 
     One robot can serve several runs, one after the other. A time that is not after the last one begins a run, which
     waits for a controller.
@@ -185,6 +189,7 @@ class SimulatedRobot:
     """
 
     _prefix = ""
+    sees_losses = True
 
     @checked
     def __init__(
@@ -233,13 +238,18 @@ class SimulatedRobot:
         self._t, begun = t, time.monotonic()
         for kind, outlet in self._outlets.items():
             is_odometry = kind == "Odometry"
-            outlet.write(node.odometry(values, t, self._turns_about) if is_odometry else node.joints(values, t))
+            published = node.odometry(values, t, self._turns_about) if is_odometry else node.joints(values, t)
+            outlet.write(published)
+        label = _label_of([published])
 
         def answered_or_ended() -> bool:
             ended = set(writers).isdisjoint(inlet.writers())  # before receiving what it last sent
             if not ended:
                 inlet.wait(WAIT_SLICE)
-            answer.extend(inlet.receive())
+            for message in inlet.receive():
+                labels = [dimension.label for dimension in message.layout.dim]
+                if label in labels or not any(other.startswith(ANSWERS) for other in labels):
+                    answer.append(message)
             return bool(answer) or ended
 
         _wait(answered_or_ended, self._patience, lambda: f"commands: got no command on {self._topic}")
@@ -257,6 +267,12 @@ class SimulatedRobot:
         if self.unanswered:
             lines.append(f"states after the controller's end, with its last command: {self.unanswered}")
         return "\n".join(lines)
+
+
+def _label_of(states: Iterable[Any]) -> str:
+    """The label of a command that answers messages of states, by the oldest of their stamps."""
+    stamps = [state.header.stamp for state in states]
+    return "{}{}.{:09d}".format(ANSWERS, *min((stamp.sec, stamp.nanosec) for stamp in stamps))
 
 
 def _quantiles(seconds: npt.ArrayLike) -> str:
@@ -348,6 +364,7 @@ class _Inlet:
         self._readers = {kind: node.reader(topic, kind, reliable=reliable) for kind, topic in topics.items()}
         self._arrived, self._known = dict.fromkeys(topics, -math.inf), {kind: set[str]() for kind in topics}
         self.state, self.refused = np.zeros(len(states)), (0, "")
+        self.messages = dict[str, Any]()  # the newest of each topic, whether it was used or not
 
     @property
     def arrived(self) -> float:
@@ -371,11 +388,12 @@ class _Inlet:
     def lacking(self) -> str:
         return f"states: got no {', '.join(sorted(self._lacking))} from {', '.join(self._topics.values())}"
 
-    def receive(self) -> bool:
-        """Receive new messages. Returns whether all parts of the state are new."""
+    def receive(self) -> tuple[bool, bool]:
+        """Receive new messages. Returns whether some part of the state is new, and whether all parts are."""
         now = time.monotonic()
         for kind, reader in self._readers.items():
             for message in reader.receive():
+                self.messages[kind] = message
                 try:
                     is_odometry = kind == "Odometry"
                     values = _parse_odometry(message, self._turns_about) if is_odometry else _parse_joints(message)
@@ -392,7 +410,7 @@ class _Inlet:
                     self.state[self._wanted[name]] = values[name]
                 self._lacking -= used
                 self._arrived[kind] = now
-        return self.arrived == now
+        return max(self._arrived.values()) == now, self.arrived == now
 
 
 def _parse_odometry(message: Any, turns_about: str | None = None) -> dict[str, float]:
@@ -455,9 +473,10 @@ class _Node:
         reliability = policy.Reliability.Reliable(self.one_second) if reliable else policy.Reliability.BestEffort
         return core.Qos(reliability, history, policy.DataRepresentation(use_cdrv0_representation=True))
 
-    def numbers(self, numbers: Array) -> Any:
-        types = self._ros.messages
-        layout = types["MultiArrayLayout"](dim=[], data_offset=0)
+    def numbers(self, numbers: Array, label: str = "") -> Any:
+        types, size = self._ros.messages, len(numbers)
+        dim = [types["MultiArrayDimension"](label=label, size=size, stride=size)] if label else []
+        layout = types["MultiArrayLayout"](dim=dim, data_offset=0)
         return types["Float64MultiArray"](layout=layout, data=[float(number) for number in numbers])
 
     def odometry(self, values: Mapping[str, float], t: float, turns_about: str | None = None) -> Any:

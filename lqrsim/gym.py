@@ -417,7 +417,8 @@ class Expert:
         observation, reward, *ended, info = env.step(expert(observation))
 
     For the observation (n+1,) of an `Environment` it returns the action (m,); for the observations (K, n+1) of a
-    `VectorEnvironment`, the actions (K, m). At time 0 the controller starts anew.
+    `VectorEnvironment`, the actions (K, m). At time 0 the controller starts anew. Observations do not say which
+    measurements got lost: for a controller with a filter, a state that equals the last one did.
 
     Args:
       env: the environment, possibly in wrappers that change neither observations nor actions.
@@ -430,6 +431,7 @@ class Expert:
         self._law._check_reads_states()
         self._task, self._steps = unwrapped.task, unwrapped.solution.trajectory.steps
         self._run: ControllerRun | None = None
+        self._previous: Array | None = None
 
     def __call__(self, observation: npt.ArrayLike) -> Array:
         """The action for an observation. Raises InputError unless the environment can have made it."""
@@ -441,9 +443,13 @@ class Expert:
         if not ((rows[:, -1] >= 0) & (rows[:, -1] <= 1)).all():
             raise InputError(f"observation: got {excerpt(rows[:, -1])} as its time, want fractions of the horizon")
         step = round(float(rows[:, -1].max()) * self._steps)
+        measured, previous = rows[:, :-1], self._previous
         if step == 0 or self._run is None:
-            self._run = self._law.start(len(rows))
-        return self._task.actions_of(self._run.control(step, rows[:, :-1])).reshape(*seen.shape[:-1], -1)
+            self._run, previous = self._law.start(len(rows)), None
+        self._previous = measured.copy()
+        if self._law.sees_losses and previous is not None:
+            measured = np.where((measured == previous).all(axis=1, keepdims=True), np.nan, measured)
+        return self._task.actions_of(self._run.control(step, measured)).reshape(*seen.shape[:-1], -1)
 
 
 class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):

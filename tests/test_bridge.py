@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from linear_plans import double_integrator, law_of
 from sampling import rarely
 from scipy.spatial.transform import Rotation
 from tracking import hover
@@ -244,14 +245,58 @@ def test_by_the_clock_a_slow_simulation_gets_no_old_commands(slow: Sequence[int]
             time.sleep(3.5 * law.dt if j in slow else 0.0)
         thread.join(PATIENCE)
     answered, safe = len(robot.round_trips), got.index(-1.5)
-    for j, command in enumerate(got[:safe]):  # a command may be on its way when its robot publishes the next state
-        fresh = [law(state, k * law.dt)[0] for state in states[max(j - 1, 0) : j + 1] for k in range(12)]
+    for state, command in zip(states, got[:safe], strict=False):
+        fresh = [law(state, k * law.dt)[0] for k in range(12)]
         assert np.abs(np.array(fresh) - command).min() < 1e-15
     assert ran[0].completed
     assert got[safe:] == [-1.5] * (12 - safe)
     assert safe <= answered <= safe + 1
     assert answered + robot.unanswered == 12
     assert f"controller's end, with its last command: {robot.unanswered}" in robot.summary()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_filter_is_told_what_got_lost(seed: int, topics: dict[str, Any]) -> None:
+    """States that equal the last one are measurements; those of NaN got lost. Commands by hand, to rounding."""
+    rng, steps = np.random.default_rng(seed), 12
+    system = double_integrator(controls=rng.normal(size=(steps, 1)), limits=(-5.0, 5.0))
+    law = law_of(system).policy
+    names = dict(zip(law.state_coordinates.names, JOINT, strict=True))
+    where: dict[str, Any] = {"joints": topics["odometry"], "commands": topics["commands"], "patience": PATIENCE}
+    thread, ran = meanwhile(lambda: bridge.run(law, safe=[0.0], lockstep=True, names=names, **where))
+    state, z, wanted, got = rng.normal(size=2), law.start(), [], []
+    with bridge.SimulatedRobot(system.solution, names=names, **where) as robot:
+        for t in range(steps):
+            lost = t > 0 and rng.random() < 0.3
+            state = state if rng.random() < 0.5 else rng.normal(size=2)
+            got.append(robot(np.full(2, np.nan) if lost else state, t * law.dt))
+            command, z = law.step(z, None if lost else state, t * law.dt)
+            wanted.append(command)
+        thread.join(PATIENCE)
+    np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-12)
+    assert ran[0].completed
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_command_that_answers_an_earlier_state_is_skipped(seed: int, topics: dict[str, Any]) -> None:
+    """It was computed just before the state arrived. Commands without a label are those of other programs."""
+    rng, law, node = np.random.default_rng(seed), policy(), bridge._Node(None)
+    where: dict[str, Any] = {"joints": topics["odometry"], "commands": topics["commands"], "patience": PATIENCE}
+    outlet, inlet = node.writer(where["commands"], "Float64MultiArray"), node.reader(where["joints"], "JointState")
+    with bridge.SimulatedRobot(law, **where) as robot:
+        last = None
+        for t in range(6):
+            thread, got = meanwhile(lambda t=t: robot(rng.normal(size=2), t * law.dt))
+            assert inlet.wait(PATIENCE)
+            (state,) = inlet.receive()
+            if last is not None and rng.random() < 0.7:
+                outlet.write(node.numbers(np.array([-1.0]), bridge._label_of([last])))
+            wanted = rng.uniform(-0.5, 0.5, size=1)
+            outlet.write(node.numbers(wanted, bridge._label_of([state]) if rng.random() < 0.5 else ""))
+            thread.join(PATIENCE)
+            np.testing.assert_array_equal(got, [wanted])
+            last = state
+    assert robot.unanswered == 0
 
 
 @pytest.mark.parametrize("lockstep", [False, True])

@@ -24,6 +24,7 @@ from lqrsim.simulation.disturbances import (
     Saturation,
     TorqueNoise,
 )
+from lqrsim.simulation.effects import seeded
 
 DT = 1 / 30
 RESTLESS = MeasurementNoise(1e-3)  # so that no two states or commands are equal
@@ -218,3 +219,37 @@ def test_a_wheel_that_lost_its_drive_turns_freely(arena):
     held = simulate(arena, braking)
     assert abs(held.states[0, -1, 2] - np.pi / 2) < 0.01
     assert free.states[0, -1, 2] < np.pi / 2 - 0.1
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_controller_that_sees_losses_is_told_which_measurements_got_lost(cage, seed):
+    """In any order with noise, a bias and a latency, and where the robot stands still; others get the last that came.
+
+    The losses are drawn again by hand. Behind the dropouts a latency delays them, too.
+    """
+    rng, steps, trials = np.random.default_rng(seed), 20, 3
+    loss = [0.4, GilbertElliott(0.2, 0.4)][seed % 2]
+    latency, further = int(rng.integers(1, 4)), [MeasurementNoise(0.01), MeasurementBias(0.01)][: int(rng.integers(3))]
+    links = [MeasurementDropouts(loss), *([MeasurementLatency(latency)] if rng.random() < 0.7 else []), *further]
+    links = [links[i] for i in rng.permutation(len(links))]
+    place = next(i for i, link in enumerate(links) if isinstance(link, MeasurementDropouts))
+    behind = sum(link.periods for link in links[place:] if isinstance(link, MeasurementLatency))
+    make, plan = seeded(seed), hover(steps)
+    drawn = MeasurementDropouts(loss).draw(steps + 1, [make(trial, place) for trial in range(trials)])
+    lost = drawn[:, np.maximum(np.arange(steps) - behind, 0)]
+    shown = {True: [], False: []}
+    for sees, seen in shown.items():
+
+        def hovering(state, t, seen=seen):
+            seen.append(state)
+            return plan.trajectory.controls[0]
+
+        hovering.sees_losses = sees
+        rollout = simulate(cage, plan, controller=hovering, disturbances=links, trials=trials, seed=seed)
+        assert np.isfinite(rollout.measured).all()
+    told, held = (np.reshape(seen, (steps, trials, 12)).swapaxes(0, 1) for seen in shown.values())
+    np.testing.assert_array_equal(np.isnan(told), np.repeat(lost[:, :, None], 12, axis=2))
+    for k in range(trials):
+        expected = received(lost[k], plan.trajectory.states[0], told[k])
+        np.testing.assert_array_equal(held[k], expected)
+    np.testing.assert_array_equal(held, rollout.measured[:, :-1])

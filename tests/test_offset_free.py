@@ -10,6 +10,8 @@ from sampling import rarely
 from tracking import hover, track
 
 import lqrsim as ls
+from lqrsim.control.controllers import OutputFeedback
+from lqrsim.control.offset_free import FilterRun
 from lqrsim.disturbances import (
     CommandDropouts,
     ControlDelay,
@@ -99,11 +101,33 @@ def test_lost_measurements_are_predicted() -> None:
     assert 0 < came_first.sum() < 20
     errors = np.abs(begun.estimates[:-1, :, :2] - states[:-1])[:, came_first]
     assert errors.max() < 1e-9
-    # Until the first measurement comes, the plan's first state is shown: it is not taken for one.
+    # Until the first measurement comes, the estimate is the plan's first state.
     first = np.argmin(lost, axis=0)
     for k in np.flatnonzero(~came_first):
         np.testing.assert_allclose(begun.estimates[0, k], system.plan.states[0], rtol=0, atol=1e-12)
         assert np.isnan(begun.innovations[: first[k], k]).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_measurement_that_equals_the_last_one_is_a_measurement(seed: int) -> None:
+    """A robot that stands still, with exact sensors: its filter takes in each of them, and so does its policy."""
+    rng, latency, steps = np.random.default_rng(seed), seed % 3, 20
+    system = double_integrator(start=rng.normal(size=2), controls=rng.normal(size=(steps, 1)))
+    uncertainty = Uncertainty(unknowns=[PUSH], start=0.3, latency=latency)
+    law = ls.OffsetFree(system.problem, system.solution, uncertainty, tolerate=0.5, effort=2.0, record=True)
+    state = system.plan.states[0] + (seed > 2) * np.array([0.2, 0.0])
+    of_law, of_policy, z = law.start(1), OutputFeedback(law.policy).start(1), law.policy.start()
+    for t in range(steps):
+        of_law.control(t, state[None])
+        command, z = law.policy.step(z, state, t * DT)
+        np.testing.assert_array_equal(of_policy.control(t, state[None])[0], command)
+    assert isinstance(of_law, FilterRun)
+    assert of_law.estimates is not None
+    assert of_law.innovations is not None
+    used = slice(0, steps - latency)
+    assert np.isfinite(of_law.innovations[used]).all()
+    # RESOLUTION is the noise that the filter assumes of exact sensors, relative to what it predicts.
+    np.testing.assert_allclose(of_law.estimates[used, 0, :2], np.tile(state, (steps - latency, 1)), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("stated", [0.2, 0.0])
@@ -130,7 +154,7 @@ def test_an_error_of_the_start_is_not_taken_for_a_mass(stated: float) -> None:
     run, x, load = law.start(trials), 0.2 * rng.normal(size=(trials, 2)), 0.06 * rng.normal(size=trials)
     reached, left = np.tile(plan.controls[0], (trials, 1)), np.exp(-dt / 0.05)
     for t in range(steps):
-        shown = np.tile(plan.states[0], (trials, 1)) if t == 0 and stated else x
+        shown = np.full((trials, 2), np.nan) if t == 0 and stated else x
         command = run.control(t, shown)
         applied = command + (1 - left) * 0.05 / dt * (reached - command)
         reached = command + left * (reached - command)

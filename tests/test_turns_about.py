@@ -160,7 +160,7 @@ def test_laws_and_filters_turn_on_in_c_too(tmp_path: Path) -> None:
         law = CompiledLaw(policy, tmp_path / name)
         run = ls.simulate(plant, plan, controller=law, disturbances=NOISE, trials=3, seed=0)
         again = as_controller(policy, plan, robot.dynamics)[0].start(3)
-        commands = [again.control(step, run.measured[:, step]) for step in range(STEPS)]
+        commands = [again.control(step, run.controller_run.shown[step]) for step in range(STEPS)]
         # 1e-9 N: rounding of filters whose gains are large.
         np.testing.assert_allclose(run.commanded, np.stack(commands, axis=1), rtol=0, atol=1e-9)
         assert run.outcome == ("reached",) * 3

@@ -72,7 +72,8 @@ class ControllerRun(abc.ABC):
 
         Args:
           step: number of the control period; called once for each, in order.
-          measured: (K, n), the measured states; for a controller with `sensors` their readings, (K, Y).
+          measured: (K, n), the measured states, NaN where one got lost if the controller `sees_losses`; for a controller
+            with `sensors` their readings, (K, Y).
         """
 
     def estimator_diverged(self) -> Mapping[int, str]:
@@ -97,7 +98,12 @@ class Controller(abc.ABC):
 
     Running a controller does not change it: `start` returns the state of a run, so one controller can serve several
     runs at once.
+
+    Attributes:
+      sees_losses: whether a measurement that got lost is shown as NaN; else the last one that arrived is repeated.
     """
+
+    sees_losses: bool = False
 
     @abc.abstractmethod
     def start(self, trials: int) -> ControllerRun:
@@ -205,12 +211,10 @@ class Feedback(_OfPolicy, ControllerRun):
 
 @dataclass(frozen=True, eq=False)
 class OutputFeedback(_OfPolicy):
-    """An `OutputFeedbackPolicy` that measures states. A measurement that is bit-identical to the last one was lost.
-
-    Until the first measurement arrives, it may be shown already, as `MeasurementLatency` does.
-    """
+    """An `OutputFeedbackPolicy` that measures states."""
 
     policy: OutputFeedbackPolicy
+    sees_losses = True
 
     def __post_init__(self) -> None:
         states, names = self.policy.state_coordinates.names, self.policy.measured_coordinates.names
@@ -229,31 +233,23 @@ class OutputFeedback(_OfPolicy):
 
 class _OutputFeedbackRun(ControllerRun):
     def __init__(self, controller: OutputFeedback, trials: int) -> None:
-        policy, n = controller.policy, len(controller.policy.state_coordinates)
-        self._policy, self._measures = policy, controller.measures
-        self._z, self._previous = np.tile(policy.start(), (trials, 1)), np.full((trials, n), np.nan)
+        self._policy, self._measures = controller.policy, controller.measures
+        self._z = np.tile(controller.policy.start(), (trials, 1))
         self._diverged: dict[int, str] = {}
-        # Nothing moves the estimate of the state in the periods before the first measurement arrives.
-        moved = policy.correction.any(axis=(1, 2)) | policy.input[:, :n].any(axis=(1, 2))
-        moved |= policy.drift[:, :n].any(axis=1)
-        moved |= (policy.transition[:, :n] != np.eye(n, policy.transition.shape[2])).any(axis=(1, 2))
-        self._waits = int(moved.argmax()) if moved.any() else policy.steps
 
     def estimator_diverged(self) -> Mapping[int, str]:
         return self._diverged
 
     def control(self, step: int, measured: Array) -> Array:
         policy, commands = self._policy, np.empty((len(measured), len(self._policy.control_coordinates)))
-        for k, (state, previous) in enumerate(zip(measured, self._previous, strict=True)):
-            y = None if np.array_equal(state, previous) else state[self._measures]
+        for k, state in enumerate(measured):
+            y = None if np.isnan(state).all() else state[self._measures]
             with np.errstate(over="ignore", invalid="ignore"):
                 commands[k], z = policy.step(self._z[k], y, step * policy.dt)
             if np.isfinite(z).all():
                 self._z[k] = z
             else:  # `step` would refuse it, and end the other trials, too
                 self._diverged.setdefault(k, "the state of the filter is not finite")
-        if step >= self._waits:
-            self._previous[:] = measured
         return commands
 
 
@@ -344,10 +340,13 @@ class BeliefRun(ControllerRun):
 
 
 class FunctionController(Controller, ControllerRun):
-    """A function of the measured state (n,) and the time in s, held within the robot's limits. It is its own run."""
+    """A function of the measured state (n,) and the time in s, held within the robot's limits. It is its own run.
+
+    The function may have an attribute `sees_losses`.
+    """
 
     def __init__(self, function: ControlFunction, dynamics: Dynamics, dt: float) -> None:
-        self.function, self.dt = function, dt
+        self.function, self.dt, self.sees_losses = function, dt, bool(getattr(function, "sees_losses", False))
         self._coordinates = spaces_of(dynamics)
 
     def start(self, trials: int) -> ControllerRun:

@@ -170,8 +170,6 @@ class FilterRun(ControllerRun):
         self.model = law.model  # for predictions, independent of a later plan's assumptions about the unknowns
         self._trials = trials
         self.z = np.tile(law.nominal[0], (trials, 1))
-        # If the first measurement is lost, it counts as the plan's first state.
-        self._last_measured = np.tile(law.model.plan.states[0], (trials, 1))
         self._diverged: dict[int, str] = {}
         self._innovation = np.empty((trials, law.model.sensor.size))
         self._limit_factors = np.ones(trials)  # factors on the limits of corrections; see `kernels/feedback.py`
@@ -200,8 +198,7 @@ class FilterRun(ControllerRun):
             self._predict(self.z, self._commands.pop(0))
         # After the horizon the last gain stays in force.
         knot = min(step - self.first - self._latency, law.model.plan.steps)
-        lost = (measured == self._last_measured).all(axis=1).astype(np.float64)
-        self._last_measured[:] = measured
+        lost = np.isnan(measured).all(axis=1).astype(np.float64)
         model.compiled.correct(
             self._trials, in_c_order(measured), lost, in_c_order(law.model.plan.states[knot]),
             law.filter.gain[knot], law.filter.limit[knot], self._limit_factors, model.derivatives.compiled_sensor,
@@ -242,7 +239,7 @@ class OffsetFree(Controller):
     """Tracks a plan, with estimates of the state, the actuators' outputs and the unknowns.
 
     Gains are computed in advance, about the plan. Predictions use the nonlinear dynamics with the estimated
-    unknowns. A measurement that is bit-identical to the last one counts as lost, and is predicted; one that is late by
+    unknowns. A measurement that got lost is predicted; a run is shown it as NaN. One that is late by
     `uncertainty.latency` is used at the time to which it belongs. The filter uses commands after saturation, so there
     is no windup. The filter never assumes an exact model: controls are off by at least 2 % of the tolerated effort, and
     predicted states by at least 2 % of what that effort moves them in two periods. A single measurement changes an
@@ -281,6 +278,8 @@ class OffsetFree(Controller):
       weights: the law's weights of deviations from the plan; `weights.emphasis` is None with given tolerances.
       gain, offset: of the law, (T, m, Z) and (T, m). nominal: z in an undisturbed run, (T+1, Z).
     """
+
+    sees_losses = True
 
     @checked
     def __init__(

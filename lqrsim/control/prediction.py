@@ -341,7 +341,7 @@ def sample_loop(
             off = norm(states[t] - plan.states[t])
             farthest = np.maximum(farthest, np.where(finite, off, np.inf))
             if t < plan.steps:
-                commands[t] = robots.advance(t, run.control(t, robots.measure(t)))
+                commands[t] = robots.advance(t, run.control(t, robots.measure(t, shows_losses=controller.sees_losses)))
     stayed = np.isfinite(farthest)
     off, commands = (states - plan.states[:, None])[:, stayed], commands[:, stayed]
     mean = off.mean(axis=1)
@@ -391,13 +391,13 @@ class _Robots:
         self.z[:, : model.n] = x
         return x
 
-    def measure(self, t: int) -> Array:
+    def measure(self, t: int, *, shows_losses: bool) -> Array:
         uncertainty, measured = self.model.uncertainty, self._late_measured
         measured.append(self.z[:, : self.model.n] + self._normal(self.model.n) * self.model.measurement_std)
         arrived = measured.popleft() if t >= uncertainty.latency else measured[0]
         lost = self.rng.random((self._trials, 1)) < uncertainty.loss
         self._measured = np.where(lost, self._measured, arrived)
-        return self._measured
+        return np.where(lost, np.nan, arrived) if shows_losses else self._measured
 
     def advance(self, t: int, commands: Array) -> Array:
         """Advance by a control period, under commands (K, m). Returns the applied commands."""

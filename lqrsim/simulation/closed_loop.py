@@ -318,7 +318,8 @@ class ClosedLoop:
       remaining_plan: the plan of the run, the given one or else the controller's own, from the knot on.
       trajectory: its trajectory.
       state_coordinates, control_coordinates: those of the controller, with limits within the robot's limits.
-      step: number of the next control period. measured: (K, n), the measured states at its beginning.
+      step: number of the next control period. measured: (K, n), the measured states at its beginning. lost: (K,) which
+        of them got lost; these are the last ones that arrived.
       controller_run: the run of the controller.
     """
 
@@ -431,8 +432,8 @@ class ClosedLoop:
         return True
 
     def measure(self, step: int) -> Array:
-        measured = self.effects.measure(self.knot + step, self.states)
-        invalid = self.physics.unstable | _not_finite(measured)
+        measured, self.lost = self.effects.measure(self.knot + step, self.states)
+        invalid = self.physics.unstable | _not_finite(self.states) | _not_finite(measured)
         self.records.knot(step, self.states, measured, self.collisions.clearance, invalid)
         over = self.records.over(step)
         if over.any():  # trials that have ended continue in the plan's states, so as not to disturb the others
@@ -445,6 +446,8 @@ class ClosedLoop:
         observed, knot = measured, self.knot + step
         if self._readings is not None:
             observed = self._readings.arriving(knot, self.states, measured)
+        elif self.law.sees_losses:
+            observed = np.where(self.lost[:, None], np.nan, measured)
         try:
             commands = shaped("commands", self.controller_run.control(knot, observed), shape)
             failed = _not_finite(commands)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from lqrsim.annotations import Want
 from lqrsim.errors import Array, InputError, check_kind, excerpt, shaped
@@ -39,6 +40,7 @@ class Effects:
                 self.displaced += shaped(f"{name}: displaced", effect.displaced, self.displaced.shape)
         if not np.isfinite(self.displaced).all():
             raise InputError("disturbances: got infinite displacements of obstacles, want finite numbers")
+        self._arrived = np.tile(plan.states[0], (len(trials), 1))  # the last measurements that arrived
         self._measures, self._actuations = self._hooks("measure"), self._hooks("actuate")
         self._reads, self._kicks = self._hooks("read"), self._hooks("kick")
         winds = [(slice(6, 9), 1.0)] if plant.has_medium else []
@@ -88,8 +90,7 @@ class Effects:
 
         Those of readings are called where a controller reads: see `Readings.arriving`.
         """
-        for _, measure in self._measures:
-            measure(step, states.copy())
+        self.measure(step, states)
         for _, actuate in self._actuations:
             actuate(step, controls.copy())
         for _, push, _, _ in self._pushes:
@@ -97,12 +98,15 @@ class Effects:
         for _, kick in self._kicks:
             kick(step, states, controls)
 
-    def measure(self, step: int, states: Array) -> Array:
-        """The measured states (K, n) for the true states."""
-        measured = states.copy()
+    def measure(self, step: int, states: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+        """The measured states (K, n) for the true states, and which got lost, (K,): the last ones that arrived."""
+        measured, lost = states.copy(), np.zeros(len(states), dtype=bool)
         for name, measure in self._measures:
             measured = shaped(name, measure(step, measured), measured.shape)
-        return measured
+        if self._measures:
+            lost = np.isnan(measured).all(axis=1)
+            measured = self._arrived = np.where(lost[:, None], self._arrived, measured)
+        return measured.copy(), lost
 
     def read(self, step: int, readings: dict[str, Array]) -> dict[str, Array]:
         """The readings (K, any) of sensors, by name, with errors."""

@@ -295,7 +295,6 @@ class Dropouts(Disturbance):
 
     what: ClassVar[str]
     discrete = True
-    hook: ClassVar[Literal["measure", "actuate"]]  # the field of an `Effect`
     uncertainty_field: ClassVar[str]  # the field of an Uncertainty
 
     def __post_init__(self) -> None:
@@ -329,26 +328,19 @@ class Dropouts(Disturbance):
             return self.loss.draw(steps, generators)
         return uniform(generators, steps, 1)[..., 0] < self.loss
 
-    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        steps, first = plan.steps, plan.controls[0]
-        if self.hook == "measure":
-            steps, first = steps + 1, plan.states[0]
-        lost, last = self.draw(steps, generators), np.tile(first, (len(generators), 1))
-
-        def receive(step: int, values: Array) -> Array:
-            last[~lost[:, step]] = values[~lost[:, step]]
-            return last.copy()
-
-        return replace(Effect(), **{self.hook: receive})
-
 
 class MeasurementDropouts(Dropouts):
     """Measurements are lost, each with the probability `loss`, or in bursts by `GilbertElliott`.
 
-    The last measurement that arrived is repeated; at first, the plan's first state.
+    A filter is told. For other controllers the last measurement that arrived is repeated; at first, the plan's first
+    state.
     """
 
-    what, hook, uncertainty_field = "measurements", "measure", "loss"
+    what, uncertainty_field = "measurements", "loss"
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        lost = self.draw(plan.steps + 1, generators)
+        return Effect(measure=lambda step, states: np.where(lost[:, step, None], np.nan, states))
 
 
 class CommandDropouts(Dropouts):
@@ -357,4 +349,13 @@ class CommandDropouts(Dropouts):
     The actuators keep the last command that arrived; at first, the plan's first control.
     """
 
-    what, hook, uncertainty_field = "commands", "actuate", "command_loss"
+    what, uncertainty_field = "commands", "command_loss"
+
+    def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
+        lost, in_force = self.draw(plan.steps, generators), np.tile(plan.controls[0], (len(generators), 1))
+
+        def actuate(step: int, controls: Array) -> Array:
+            in_force[~lost[:, step]] = controls[~lost[:, step]]
+            return in_force.copy()
+
+        return Effect(actuate=actuate)
