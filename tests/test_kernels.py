@@ -1309,14 +1309,15 @@ class TestDesigns:
         def design() -> list[Array]:
             filtered = plan_model.kalman_filter(model, known=np.tril(rng_of_root.normal(size=(model.size,) * 2)))
             filtered_from_start = plan_model.kalman_filter(model)
-            laws = tracking.tracking_laws(model, weights)
-            loop = prediction.LinearLoop(model, *laws, filtered_from_start.gain, limits)
+            gain, offset, _ = tracking.tracking_law(model, weights)
+            loop = prediction.LinearLoop(model, gain, offset, filtered_from_start.gain, limits)
             return [
                 *filtered,
                 *filtered_from_start,
-                *laws,
+                gain,
+                offset,
                 *loop.moments(),
-                *prediction.with_filter(model, filtered, *laws, limits),
+                *prediction.with_filter(model, filtered, gain, offset, limits),
             ]
 
         rng_of_root = np.random.default_rng(0)

@@ -18,7 +18,7 @@ from sympy import cos, exp, sin
 import lqrsim as ls
 from lqrsim.control.plan_model import PlanDerivatives, PlanModel, kalman_filter, recursions
 from lqrsim.control.prediction import LinearLoop, with_filter
-from lqrsim.control.tracking import Laws, Weights, tracking_laws
+from lqrsim.control.tracking import Weights, tracking_law
 from lqrsim.disturbances import Uncertainty, Unknown
 from lqrsim.errors import Array
 
@@ -154,7 +154,7 @@ def test_laws_are_dense_least_squares_of_the_same_cost(structure: int, seed: int
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
     model = PlanModel(PlanDerivatives(system.problem.dynamics, system.plan), uncertainty)
     weights = weights_of(rng, n, m, system.plan.steps)
-    gain, offset = tracking_laws(model, weights)
+    gain, offset, _ = tracking_law(model, weights)
     oracle = Oracle(system, uncertainty, weights, persistent=True)
     e, a, d = rng.normal(size=n), rng.normal(size=m), rng.normal(size=oracle.states_of_unknowns)
     commands = oracle.best(e, a, d)
@@ -185,7 +185,7 @@ def test_laws_of_commands_that_get_lost_are_least_squares_over_all_that_may(
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
     model = PlanModel(PlanDerivatives(system.problem.dynamics, system.plan), uncertainty)
     weights = weights_of(rng, n, m, system.plan.steps)
-    gain, offset = tracking_laws(model, weights)
+    gain, offset, _ = tracking_law(model, weights)
     oracle = Oracle(system, uncertainty, weights, persistent=True)
     e, a, d = rng.normal(size=n), rng.normal(size=m), rng.normal(size=oracle.states_of_unknowns)
     patterns = list(product((False, True), repeat=steps))
@@ -221,7 +221,7 @@ def test_moments_of_several_laws_are_those_of_a_plain_recursion(structure: int, 
     found = LinearLoop(model, gain, offset, None, limits).moments(n)
     shown, (F, G, c), onto_force = (
         np.diag(model.measurement_std**2),
-        model.step_with(model.arrived),
+        model.step_if_arrived,
         np.eye(m, model.size, n),
     )
     for i in range(3):
@@ -263,11 +263,11 @@ def test_choosing_predicts_the_moments_of_the_whole_recursion(structure: int, se
     uncertainty = dataclasses.replace(uncertainty, start=0.3, measurement=0.1, control=0.2, model_error=0.05)
     rng, (n, m) = np.random.default_rng(seed + 1), system.B.shape
     model, steps = PlanModel(PlanDerivatives(system.problem.dynamics, system.plan), uncertainty), system.plan.steps
-    laws = Laws(rng.normal(size=(3, steps, m, model.size)), rng.normal(size=(3, steps, m)))
+    gain, offset = rng.normal(size=(3, steps, m, model.size)), rng.normal(size=(3, steps, m))
     bounds = (np.full(m, -1.0), np.full(m, 1.5)) if limits else (np.full(m, -np.inf), np.full(m, np.inf))
     filtered = kalman_filter(model)
-    part = with_filter(model, filtered, *laws, bounds)
-    whole = LinearLoop(model, *laws, filtered.gain, bounds).moments(n)
+    part = with_filter(model, filtered, gain, offset, bounds)
+    whole = LinearLoop(model, gain, offset, filtered.gain, bounds).moments(n)
     for found, wanted in zip(part, whole, strict=True):
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9 * max(1.0, np.abs(wanted).max()))
 
@@ -337,7 +337,7 @@ def test_they_are_the_same_in_any_units_of_the_controls(seed: int, unstable: boo
     weights, laws = weights_of(np.random.default_rng(seed + 1), 3, 2, usual.plan.steps), []
     for system, unit in ((usual, np.ones(2)), (other, units)):
         model = PlanModel(PlanDerivatives(system.problem.dynamics, system.plan), uncertainty)
-        gain, offset = tracking_laws(model, dataclasses.replace(weights, control=weights.control * unit**2))
+        gain, offset, _ = tracking_law(model, dataclasses.replace(weights, control=weights.control * unit**2))
         entries = np.ones(model.size)
         entries[3:5] = unit  # what the actuators have reached
         laws.append((gain * unit[:, None] / entries, offset * unit))

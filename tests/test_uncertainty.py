@@ -28,6 +28,7 @@ from lqrsim.disturbances import (
     InertiaMismatch,
     InitialStateError,
     MassMismatch,
+    MeanWind,
     MeasurementBias,
     MeasurementDropouts,
     MeasurementLatency,
@@ -56,7 +57,7 @@ EXAMPLES = [
     InitialStateError(0.01), DisplacedObstacles(0.05), MassMismatch(0.1), ls.disturbances.MeasurementNoise(0.005),
     MeasurementLatency(1), MeasurementDropouts(0.2), CommandDropouts(0.2), ControlNoise(0.02),
     ControlOffset(0.02), ControlDelay(1), MotorLag(0.05), ForceNoise(0.1), TorqueNoise(0.002), ThrustMismatch(0.05),
-    ls.disturbances.MeanWind((0.5, 0.2, 0.0)), Gusts(0.5, 0.5), Dryden("light"), WheelRadiusMismatch(0.01),
+    MeanWind((0.5, 0.2, 0.0)), Gusts(0.5, 0.5), Dryden("light"), WheelRadiusMismatch(0.01),
     AxleMismatch(0.02), Payload(0.02, "quadrotor"),
 ]  # fmt: skip
 IN_WORDS = [
@@ -170,7 +171,7 @@ def test_winds_have_the_covariance_and_autocorrelation_that_is_stated(cage, wind
 
 
 def test_a_constant_wind_is_a_constant_of_its_size(cage):
-    x, y = ls.uncertainty_of(cage, [ls.disturbances.MeanWind((1.5, -0.5, 0.0))]).unknowns
+    x, y = ls.uncertainty_of(cage, [MeanWind((1.5, -0.5, 0.0))]).unknowns
     assert (x.name, x.std, x.constant, y.name, y.std, y.constant) == ("wind_x", 1.5, True, "wind_y", 0.5, True)
 
 
@@ -253,6 +254,42 @@ def test_several_add_up(cage):
     controls = cage.robot.dynamics.control_coordinates
     np.testing.assert_allclose(per_entry("", twice.control, controls), np.sqrt(2) * 0.05, rtol=1e-12)
     assert twice.delay == 2
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_parts_of_a_fixed_value_are_that_value(cage, arena, seed):
+    """Winds that add up, even to none, factors that multiply and loads on one body, in any order with what is drawn."""
+    rng = np.random.default_rng(seed)
+    parts = 1 if seed == 0 else int(rng.integers(2, 5))
+    winds, loads = rng.normal(size=(parts, 3)), rng.uniform(0.0, 0.02, size=parts)
+    winds[-1] -= winds.sum(axis=0) * [1.0, 0.0, 0.0]
+    factors, wheels = rng.uniform(0.9, 1.1, size=parts), rng.uniform(0.9, 1.1, size=(parts, 2))
+    drawn = [Gusts(0.5), MassMismatch(0.1), Dryden("light")]
+    for plant, split, whole in (
+        (
+            cage,
+            [
+                *(MeanWind(wind) for wind in winds), *(Payload(load, "quadrotor") for load in loads),
+                *(MassMismatch(factor=factor) for factor in factors), *drawn,
+            ],
+            [
+                MeanWind(winds.sum(axis=0)), Payload(loads.sum(), "quadrotor"), MassMismatch(factor=factors.prod()),
+                *drawn,
+            ],
+        ),
+        (
+            arena, [WheelRadiusMismatch(factor=factor) for factor in wheels],
+            [WheelRadiusMismatch(factor=wheels.prod(axis=0))],
+        ),
+    ):  # fmt: skip
+        shuffled = [split[i] for i in rng.permutation(len(split))]
+        found, wanted = (ls.uncertainty_of(plant, some).unknowns for some in (shuffled, whole))
+        numbers = [
+            sorted((unknown.name, unknown.time_constant, unknown.std) for unknown in some if unknown.std > 1e-12)
+            for some in (found, wanted)
+        ]
+        assert [row[:2] for row in numbers[0]] == [row[:2] for row in numbers[1]]
+        np.testing.assert_allclose([row[2] for row in numbers[0]], [row[2] for row in numbers[1]], rtol=1e-9)
 
 
 def test_what_the_robot_does_not_declare_is_left_out_by_name(arena):

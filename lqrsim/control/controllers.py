@@ -72,8 +72,8 @@ class ControllerRun(abc.ABC):
 
         Args:
           step: number of the control period; called once for each, in order.
-          measured: (K, n), the measured states, NaN where one got lost if the controller `sees_losses`; for a controller
-            with `sensors` their readings, (K, Y).
+          measured: (K, n), the measured states, NaN where one got lost for a controller that `sees_losses`; their
+            readings, (K, Y), for a controller with `sensors`.
         """
 
     def estimator_diverged(self) -> Mapping[int, str]:

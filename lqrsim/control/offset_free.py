@@ -37,15 +37,14 @@ from lqrsim.control.prediction import LinearLoop
 from lqrsim.control.replanner import ReplanLog, ReplanRule, SolveRequest
 from lqrsim.control.tracking import (
     AT_END,
-    Candidates,
+    DeviationLaw,
     Judge,
-    Laws,
     Predictions,
     Weights,
     choose_tolerances,
     effort_of,
     tolerances_to_try,
-    tracking_laws,
+    tracking_law,
 )
 from lqrsim.control.uncertainty import OFFSET, Uncertainty, Unknown, check_seconds, per_entry, triangular_root
 from lqrsim.errors import Array, InputError, check_kind
@@ -60,6 +59,7 @@ from lqrsim.results.solution_parts import Trajectory
 from lqrsim.robots.sensors import RobotSensors
 from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import clearance_of
+from lqrsim.solvers.compiled import law_about
 from lqrsim.solvers.settings import InitialGuess
 
 # The least errors that a filter assumes, relative to the tolerated effort: in each control, and in each state's
@@ -134,21 +134,14 @@ class FilterLaw:
     plan: Plan
     model: PlanModel
     filter: KalmanFilter
-    weights: Weights
-    law: Laws  # of deviations from the plan
+    tracking: DeviationLaw
     in_plan: Array | float = 0.0  # the unknowns' states (D,) with which the plan was made
 
-    # The law of the estimates z themselves, u = gain z + offset.
-
     @cached_property
-    def gain(self) -> Array:
-        """(T, m, Z)."""
-        return in_c_order(self.law.gain)
-
-    @cached_property
-    def offset(self) -> Array:
-        """(T, m)."""
-        return self.model.plan.controls + self.law.offset - np.einsum("tij,tj->ti", self.law.gain, self.nominal[:-1])
+    def absolute(self) -> Policy:
+        """The law of the estimates z themselves, u = gain z + offset: (T, m, Z) and (T, m)."""
+        gain, offset = law_about(self.nominal, self.model.plan.controls + self.tracking.offset, self.tracking.gain)
+        return Policy(in_c_order(gain), offset)
 
     @cached_property
     def nominal(self) -> Array:
@@ -162,11 +155,12 @@ class FilterRun(ControllerRun):
     """A run of `OffsetFree` with K trials: their estimates z (K, Z) at the knot of the newest measurement.
 
     If measurements are late by k periods, the filter runs k periods behind. Its estimate is predicted forward with the
-    commands since, to the time at which the next command acts. The law's plan begins at the step `first`.
+    commands since, to the time at which the next command acts. The law's plan begins at the step
+    `begins_at`.
     """
 
     def __init__(self, law: FilterLaw, trials: int, record: bool) -> None:
-        self.law, self.first = law, 0
+        self.law, self.begins_at = law, 0
         self.model = law.model  # for predictions, independent of a later plan's assumptions about the unknowns
         self._trials = trials
         self.z = np.tile(law.nominal[0], (trials, 1))
@@ -197,7 +191,7 @@ class FilterRun(ControllerRun):
         if step > self._latency:
             self._predict(self.z, self._commands.pop(0))
         # After the horizon the last gain stays in force.
-        knot = min(step - self.first - self._latency, law.model.plan.steps)
+        knot = min(step - self.begins_at - self._latency, law.model.plan.steps)
         lost = np.isnan(measured).all(axis=1).astype(np.float64)
         model.compiled.correct(
             self._trials, in_c_order(measured), lost, in_c_order(law.model.plan.states[knot]),
@@ -216,11 +210,11 @@ class FilterRun(ControllerRun):
             predicted = predicted.copy()
             for command in self._commands:
                 self._predict(predicted, command)
-        t = min(step - self.first + self._delay, law.model.plan.steps - 1)
+        t = min(step - self.begins_at + self._delay, law.model.plan.steps - 1)
         out = np.empty((self._trials, self.model.m))
         nominal = in_c_order(law.model.plan.states[t])
-        gains = Policy(law.gain[t], law.offset[t])
-        model.compiled.command(self._trials, predicted, nominal, gains, self._limits, self._turning, out)
+        at_step = Policy(law.absolute.gain[t], law.absolute.offset[t])
+        model.compiled.command(self._trials, predicted, nominal, at_step, self._limits, self._turning, out)
         self._commands.append(out.copy())
         first_implausible = np.empty(self._trials)
         model.compiled.diverged(self._trials, predicted, first_implausible)
@@ -322,15 +316,14 @@ class OffsetFree(Controller):
         kalman = kalman_filter(model) if self._sensing is None else self._sensing.along
         judge = Judge(problem, solution, model, kalman)
         if tolerate is None:
-            weights, chosen = choose_tolerances(judge, model, efforts, at_end, call="OffsetFree(...)")
+            tracking = choose_tolerances(judge, model, efforts, at_end, call="OffsetFree(...)")
         else:
-            weights = Weights.of(tolerate, efforts, problem.dynamics, at_end=at_end)
-            chosen = tracking_laws(model, weights)
-        law = FilterLaw(solution, model, kalman, weights, chosen)
+            tracking = tracking_law(model, Weights.of(tolerate, efforts, problem.dynamics, at_end=at_end))
+        law = FilterLaw(solution, model, kalman, tracking)
         if uncertainty.lag > 0 and memory < np.inf and self._sensing is None:
             law = robust_to_lag(judge, uncertainty, law, memory, efforts, at_end if tolerate is None else None)
-        self._law, self.model, self.filter, self.weights = law, law.model, law.filter, law.weights
-        self.gain, self.offset, self.nominal = law.gain, law.offset, law.nominal
+        self._law, self.model, self.filter, self.weights = law, law.model, law.filter, law.tracking.weights
+        (self.gain, self.offset), self.nominal = law.absolute, law.nominal
 
     def __repr__(self) -> str:
         plan, unknowns = self.solution.trajectory, len(self.uncertainty.unknowns)
@@ -456,11 +449,11 @@ def robust_to_lag(
     if scores[1, 0] <= scores[0, 0] + MUCH_WORSE:
         return design
     kept = at_end is None
-    weights = design.weights if kept else tolerances_to_try(design.model, effort, at_end, solution)
-    designs = [replace(design, weights=weights, law=tracking_laws(design.model, weights))]
+    weights = design.tracking.weights if kept else tolerances_to_try(design.model, effort, at_end, solution)
+    designs = [replace(design, tracking=tracking_law(design.model, weights))]
     for fraction, bypass in MILDER:
         model = assumed_model(derivatives, replace(stated, lag=fraction * stated.lag), memory, effort, bypass)
-        designs.append(FilterLaw(solution, model, kalman_filter(model), weights, tracking_laws(model, weights)))
+        designs.append(FilterLaw(solution, model, kalman_filter(model), tracking_law(model, weights)))
     outcomes = [_outcome(judge, systems, candidate) for candidate in designs]
     widths = np.array([outcome.width[0] for outcome in outcomes])
     least = judge.narrowest(widths)
@@ -468,12 +461,13 @@ def robust_to_lag(
     scores = np.where(widths > WIDEST * least, np.inf, scores[:, 0] + WITHOUT_LAG * scores[:, 1])
     i, j = np.unravel_index(int(np.argmin(scores)), scores.shape)
     best = designs[i]
-    return best if kept else FilterLaw(solution, best.model, best.filter, *Candidates(weights, best.law).pick(int(j)))
+    return best if kept else replace(best, tracking=best.tracking.pick(int(j)))
 
 
 def _outcome(judge: Judge, systems: list[PlanModel], design: FilterLaw) -> Predictions:
     """The predictions for a design in L true systems, (L, 1); or for one with C laws to choose from, (L, C)."""
-    loop = LinearLoop(systems[0], *design.law, design.filter.gain, judge.limits, design.model)
+    law = design.tracking
+    loop = LinearLoop(systems[0], law.gain, law.offset, design.filter.gain, judge.limits, design.model)
     with np.errstate(over="ignore", invalid="ignore"):  # loops that are not stable
         return judge.predictions(loop.in_systems(systems, design.model.n))
 
@@ -487,7 +481,7 @@ def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
     model, along, plan = law.model, law.model.derivatives, law.model.plan
     steps, m, latency, delay = plan.steps, model.m, model.uncertainty.latency, model.uncertainty.delay
     size, width = model.size, model.size + (latency + delay) * m
-    (F, G, c), nominal = model.step, law.nominal
+    (F, G, c), nominal, (gain, offset) = model.step, law.nominal, law.absolute
     f = nominal[1:] + c - np.einsum("tij,tj->ti", F, nominal[:-1]) - np.einsum("tij,tj->ti", G, plan.controls)
     measured = np.empty((steps + 1, model.sensor.size))  # h of y = H x + h
     along.compiled.measurements(len(measured), in_c_order(plan.states), along.compiled_sensor, measured)
@@ -512,7 +506,7 @@ def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
             onto, constant = F[j] @ onto, F[j] @ constant + f[j]
             onto[:, first + i * m : first + (i + 1) * m] += G[j]
         at = min(t + delay, steps - 1)
-        arrays["gain"][t], arrays["offset"][t] = law.gain[at] @ onto, law.gain[at] @ constant + law.offset[at]
+        arrays["gain"][t], arrays["offset"][t] = gain[at] @ onto, gain[at] @ constant + offset[at]
         transition, given, commands = arrays["transition"][t], arrays["input"][t], width - size
         transition[:size, :size] = F[knot] if t >= latency else np.eye(size)  # z waits for the first measurement
         if t >= latency:
@@ -601,7 +595,7 @@ class ReplannedRun(ControllerRun):
     def _replan(self, run: FilterRun, trial: int, step: int) -> None:
         """Replace the law of a trial by a law about a new plan, if a new plan is needed and found."""
         law, model, z = run.law, run.model, run.z[0]
-        n, done = model.n, step - run.first
+        n, done = model.n, step - run.begins_at
         # The unknowns' states that are constant to the end of the horizon and change only parameters.
         on_controls = (model.output[len(model.parameters) :] != 0).any(axis=0)
         modelled = (model.output != 0).any(axis=0) & ~on_controls
@@ -620,9 +614,9 @@ class ReplannedRun(ControllerRun):
             self.log.kept[str(error)] += 1
             return
         # In that model the actuators have no lag, gains or offsets.
-        gain, reached = law.gain[done:], law.nominal[done:-1, n : n + model.lagging]
+        gain, reached = law.absolute.gain[done:], law.nominal[done:-1, n : n + model.lagging]
         fixed = np.concatenate([reached, np.tile(in_plan, (len(gain), 1))], axis=1)
-        offset = law.offset[done:] + np.einsum("tij,tj->ti", gain[:, :, n:], fixed)
+        offset = law.absolute.offset[done:] + np.einsum("tij,tj->ti", gain[:, :, n:], fixed)
         here = dynamics.state_coordinates.nearest(z[:n], law.nominal[done, :n])
         gain = in_c_order(gain[:, :, :n])
         if not self._always and self._leads_to_goal(problem, gain, offset, here):
@@ -637,8 +631,8 @@ class ReplannedRun(ControllerRun):
         about = PlanModel(PlanDerivatives(dynamics, solution.trajectory, model.sensor), model.uncertainty)
         # The filter begins with a measurement that has been used already.
         kalman = kalman_filter(about, law.filter.corrected_root[done])
-        weights = replace(law.weights, emphasis=None)  # that of another plan
-        run.law, run.first = FilterLaw(solution, about, kalman, weights, tracking_laws(about, weights), in_plan), step
+        weights = replace(law.tracking.weights, emphasis=None)  # that of another plan
+        run.law, run.begins_at = FilterLaw(solution, about, kalman, tracking_law(about, weights), in_plan), step
 
 
 class Estimate(NamedTuple):

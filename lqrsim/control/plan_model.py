@@ -321,10 +321,14 @@ class PlanModel:
     @cached_property
     def step(self) -> LinearSteps:
         """The model, as a mean over commands that arrive and commands that get lost."""
-        return self.step_with(self.lag)
+        return self._steps(self.lag)
 
-    def step_with(self, lag: Lag) -> LinearSteps:
-        """The model for a lag: with `arrived`, a lost command is as if it had been the actuators' states."""
+    @cached_property
+    def step_if_arrived(self) -> LinearSteps:
+        """The model for a command that arrives: a lost one is as if it had been the actuators' states."""
+        return self.step if self.arrived == self.lag else self._steps(self.arrived)
+
+    def _steps(self, lag: Lag) -> LinearSteps:
         n, a, steps, jacobian = self.n, self.lagging, self.plan.steps, self.derivatives.jacobian
         F, G = np.zeros((steps, self.size, self.size)), np.zeros((steps, self.size, self.m))
         F[:, :n, :n] = jacobian[:, :, :n]
@@ -371,8 +375,7 @@ class PlanModel:
         white = [unknown.std * self._weights(unknown) for unknown in uncertainty.unknowns if unknown.white]
         constant = m + len(white)
         root = np.zeros((self.plan.steps, self.size, constant + n + self.size - first))
-        commanded = self.step_with(self.arrived).G
-        root[:, :, :m] = commanded * per_entry("Uncertainty: control", uncertainty.control, controls)
+        root[:, :, :m] = self.step_if_arrived.G * per_entry("Uncertainty: control", uncertainty.control, controls)
         if uncertainty.lag == 0:
             root[:, n:first, :m] = 0.0  # the command that stays in force after a loss has new noise
         if white:

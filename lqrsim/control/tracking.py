@@ -79,13 +79,6 @@ WORST = (1.0, 1e30, 1.0)  # the `Predictions` for a loop whose moments are not f
 OPEN = Surroundings((), (), (), 0.0)
 
 
-class Laws(NamedTuple):
-    """A law u = gain z + offset in deviations from a plan, or C laws to compare."""
-
-    gain: Array  # (T, m, Z), or (C, T, m, Z)
-    offset: Array  # (T, m), or (C, T, m)
-
-
 @dataclass(frozen=True, eq=False)
 class Weights:
     """Weights of deviations from a plan: a deviation that is just tolerated costs 1."""
@@ -105,24 +98,20 @@ class Weights:
         end[last] *= at_end
         return cls(state**-2.0, effort**-2.0, end**-2.0)
 
-    def stressing(self, emphasis: Array, factors: tuple[float, ...]) -> "Weights":
-        """These with an emphasis (T+1, n, n) times each of C factors, as those of C laws to compare."""
-        many, factor = np.ones((len(factors), 1)), np.array(factors)[:, None, None, None]
-        return Weights(many * self.state, self.control, many * self.end, factor * emphasis)
 
+class DeviationLaw(NamedTuple):
+    """A law u = gain z + offset in deviations from a plan, or C laws to compare; and the weights that it follows from."""
 
-class Candidates(NamedTuple):
-    """C laws to choose from, with the weights that they follow from; or one of them."""
-
+    gain: Array  # (T, m, Z), or (C, T, m, Z)
+    offset: Array  # (T, m), or (C, T, m)
     weights: Weights
-    laws: Laws
 
-    def pick(self, i: int) -> "Candidates":
-        """One of C."""
-        weights, (gain, offset) = self.weights, self.laws
+    def pick(self, i: int) -> "DeviationLaw":
+        """One of C laws."""
+        weights = self.weights
         emphasis = None if weights.emphasis is None else weights.emphasis[i]
         picked = Weights(weights.state[i], weights.control, weights.end[i], emphasis)
-        return Candidates(picked, Laws(gain[i], offset[i]))
+        return DeviationLaw(self.gain[i], self.offset[i], picked)
 
 
 def effort_of(effort: PerEntry | None, dynamics: Dynamics) -> Array:
@@ -137,7 +126,7 @@ def effort_of(effort: PerEntry | None, dynamics: Dynamics) -> Array:
     return CONTROL_SHARE * ranges
 
 
-def tracking_laws(model: PlanModel, weights: Weights, noise: Array | None = None, risk: float = 0.0) -> Laws:
+def tracking_law(model: PlanModel, weights: Weights, noise: Array | None = None, risk: float = 0.0) -> DeviationLaw:
     """The law for these weights, or the laws for C of them.
 
     With noise on the states, M (T, n, k), a law is averse to large deviations; the risk is theta, for half the sum that
@@ -150,7 +139,7 @@ def tracking_laws(model: PlanModel, weights: Weights, noise: Array | None = None
     movable, width = n + model.lagging, model.size + 1  # the states that controls can move, and numbers of (y, d, 1)
     state, end = np.atleast_2d(weights.state), np.atleast_2d(weights.end)
     # (y', d, 1) of (y, d, 1, u): the law assumes that d goes on as it is.
-    (F, G, c), forward = model.step_with(model.arrived), np.zeros((steps, width, width + m))
+    (F, G, c), forward = model.step_if_arrived, np.zeros((steps, width, width + m))
     forward[:, :movable] = np.concatenate([F, c[:, :, None], G], axis=2)[:, :movable]
     forward[:, range(movable, width), range(movable, width)] = 1.0
     adjoint = np.concatenate([F[:, :movable, :movable], G[:, :movable]], axis=2).transpose(0, 2, 1)
@@ -190,7 +179,7 @@ def tracking_laws(model: PlanModel, weights: Weights, noise: Array | None = None
         if emphasis is not None:
             cost[:, :n, :n] += emphasis[:, t]
     laws = laws.swapaxes(0, 1) if weights.state.ndim == 2 else laws[:, 0]
-    return Laws(laws[..., :-1], laws[..., -1])
+    return DeviationLaw(laws[..., :-1], laws[..., -1], weights)
 
 
 class Predictions(NamedTuple):
@@ -229,12 +218,12 @@ class Judge:
     def limits(self) -> tuple[Array, Array]:
         return self.solution.policy.control_coordinates.limits
 
-    def moments(self, laws: Laws) -> LoopMoments:
+    def moments(self, laws: DeviationLaw) -> LoopMoments:
         """The moments of the states under C laws, (C, ...)."""
         n = self.truth.n
         with np.errstate(over="ignore", invalid="ignore"):  # loops that are not stable
             if self.filter is not None:
-                return with_filter(self.truth, self.filter, *laws, self.limits)
+                return with_filter(self.truth, self.filter, laws.gain, laws.offset, self.limits)
             return LinearLoop(self.truth, laws.gain[..., :n], laws.offset, None, self.limits).moments(n)
 
     def predictions(self, moments: LoopMoments) -> Predictions:
@@ -271,28 +260,28 @@ class Judge:
         extents = np.ptp(self.solution.trajectory.states[:, self.norm.states], axis=0) / self.norm.scale
         return max(float(widths.min()), 1e-3 * (float(extents.max()) or 1.0))
 
-    def strays(self, laws: Laws, moments: LoopMoments, i: int) -> int:
-        """The number of runs under one of C laws that get too far from the plan, from likely deviations.
+    def strays(self, law: DeviationLaw, moments: LoopMoments, i: int) -> int:
+        """The number of runs under a law, the one of C with these moments, that get too far from the plan, from likely deviations.
 
         The law acts on the true state, in the nonlinear model. If all of these return to the plan, and the law acts on
         measured states and often reaches the limits, trials with unknowns that are drawn count as well.
         """
         plan, rng, count = self.solution.trajectory, np.random.default_rng(0), 0
-        law, mean, covariance = Laws(laws.gain[i], laws.offset[i]), moments.mean[i], moments.covariance[i]
+        mean, covariance = moments.mean[i], moments.covariance[i]
         farthest, n = FARTHEST * np.sqrt(self.norm.squares(covariance).max()), mean.shape[1]
-        gain, offset = law_about(plan.states, plan.controls + law.offset, law.gain[..., :n])
+        policy = _policy_of(self.solution, law)
         for t in (plan.steps * k // KNOTS for k in range(KNOTS)):
             variances, axes = np.linalg.eigh(covariance[t])
             off = rng.standard_normal((PAIRS, n)) * np.sqrt(np.maximum(variances, 0.0)) @ axes.T
             for start in plan.states[t] + mean[t] + np.concatenate([off, -off]):
-                states, _ = rollout(self.problem, gain[t:], offset[t:], start)
+                states, _ = rollout(self.problem, policy.gain[t:], policy.offset[t:], start)
                 with np.errstate(over="ignore", invalid="ignore"):  # of runs that diverge
                     distance = self.norm(states - plan.states[t:])
                 count += not (distance <= farthest).all()
         limited = moments.saturation[i].mean() > LIMITED
         if count or not limited or self.filter is not None or not self.truth.uncertainty.unknowns:
             return count
-        run = Feedback(_policy_of(self.solution, law))
+        run = Feedback(policy)
         return int((sample_loop(self.truth, run, self.limits, OPEN, self.norm, TRIALS, 0).farthest > farthest).sum())
 
 
@@ -302,22 +291,21 @@ def _chance_outside(bound: Array | float, off: Array, std: Array) -> Array:
     return ndtr((off - bound) / std) + ndtr((-off - bound) / std)
 
 
-def choose_tolerances(judge: Judge, model: PlanModel, effort: Array, at_end: float, *, call: str) -> Candidates:
+def choose_tolerances(judge: Judge, model: PlanModel, effort: Array, at_end: float, *, call: str) -> DeviationLaw:
     """Choose the tolerances whose law is predicted to fail least often, and that law.
 
     Args:
       model: what the laws assume.
       call: name of the user's call, for warnings.
     """
-    weights = tolerances_to_try(model, effort, at_end, judge.solution)
-    tried = Candidates(weights, tracking_laws(model, weights))
-    moments = judge.moments(tried.laws)
+    tried = tracking_law(model, tolerances_to_try(model, effort, at_end, judge.solution))
+    moments = judge.moments(tried)
     predicted = judge.predictions(moments)
     least = judge.narrowest(predicted.width)
     scores = predicted.scores(least)
     strays = dict[int, int]()  # the number of runs that stray under each law
     for best in sorted(range(len(scores)), key=lambda i: (scores[i], -i)):  # of equals the gentlest first
-        strays[best] = judge.strays(tried.laws, moments, best)
+        strays[best] = judge.strays(tried.pick(best), moments, best)
         if not strays[best]:
             break
     else:
@@ -335,12 +323,13 @@ def choose_tolerances(judge: Judge, model: PlanModel, effort: Array, at_end: flo
     emphasis = judge.surroundings.emphasis(model.plan.states + mean, covariance, across, chosen.weights.state)
     if not emphasis.any():
         return chosen
-    weights = chosen.weights.stressing(emphasis, EMPHASIS)
-    stressed = Candidates(weights, tracking_laws(model, weights))
-    moments = judge.moments(stressed.laws)
+    weights, many, factors = chosen.weights, np.ones((len(EMPHASIS), 1)), np.array(EMPHASIS)[:, None, None, None]
+    emphasised = Weights(many * weights.state, weights.control, many * weights.end, factors * emphasis)
+    stressed = tracking_law(model, emphasised)
+    moments = judge.moments(stressed)
     stressed_scores = judge.predictions(moments).scores(least)
     i = int(np.argmin(stressed_scores))
-    better = stressed_scores[i] < scores[best] and judge.strays(stressed.laws, moments, i) <= strays[best]
+    better = stressed_scores[i] < scores[best] and judge.strays(stressed.pick(i), moments, i) <= strays[best]
     return stressed.pick(i) if better else chosen
 
 
@@ -408,28 +397,27 @@ def track(
         raise InputError("track: tolerate: got none, want deviations, such as {'m': 0.05, 'm/s': 0.2}, or uncertainty=")
     else:
         judge = Judge(problem, solution, PlanModel(derivatives, uncertainty))
-        law = choose_tolerances(judge, model, efforts, at_end, call="track(...)").laws
+        law = choose_tolerances(judge, model, efforts, at_end, call="track(...)")
     return _policy_of(solution, law)
 
 
-def _policy_of(solution: Solution, law: Laws) -> AffinePolicy:
+def _policy_of(solution: Solution, law: DeviationLaw) -> AffinePolicy:
     """The policy of a law about the solution's plan. The command in force has no effect on a command that arrives."""
-    plan, (gain, offset), policy = solution.trajectory, law, solution.policy
-    gain = gain[..., : plan.states.shape[1]]
-    offset = plan.controls + offset - np.einsum("tij,tj->ti", gain, plan.states[:-1])
-    return replace(policy, gain=gain, offset=offset, nominal=plan.states[:-1].copy(), dt=plan.dt)
+    plan = solution.trajectory
+    gain, offset = law_about(plan.states, plan.controls + law.offset, law.gain[..., : plan.states.shape[1]])
+    return replace(solution.policy, gain=gain, offset=offset, nominal=plan.states[:-1].copy(), dt=plan.dt)
 
 
-def _law(problem: Problem, solution: Solution, model: PlanModel, weights: Weights, risk: float) -> Laws:
+def _law(problem: Problem, solution: Solution, model: PlanModel, weights: Weights, risk: float) -> DeviationLaw:
     """The law, with the risk if it is not 0. If the risk is too high, raises InputError with the largest possible."""
     if not risk or problem.noise is None:
-        return tracking_laws(model, weights)
+        return tracking_law(model, weights)
     plan = solution.trajectory
     matrices = problem.noise.matrices(problem.dynamics, plan.states[:-1], plan.controls)
 
-    def law_of(tried: float) -> Laws | None:
+    def law_of(tried: float) -> DeviationLaw | None:
         try:
-            return tracking_laws(model, weights, matrices, tried)
+            return tracking_law(model, weights, matrices, tried)
         except np.linalg.LinAlgError:
             return None
 

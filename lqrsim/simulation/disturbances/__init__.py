@@ -127,18 +127,25 @@ def _affects(disturbance: Disturbance, plant: Plant) -> bool:
 def uncertainty_of(plant: Plant, disturbances: Sequence[Disturbance | Noise]) -> Uncertainty:
     """Convert disturbances to zero-mean Gaussian uncertainty. Disturbances that do not fit are left out, by name.
 
-    A fixed value (`MeanWind`, the `factor` of a mismatch) counts as unknown, with its size as standard deviation. A
-    truncated normal distribution counts with its own standard deviation. Losses in bursts count as independent ones,
-    and displaced obstacles as displaced equally along all axes. `left_out` lists, with reasons, the disturbances that
-    the robot's dynamics do not declare, and all that are not small, lasting and linear: pushes, narrower limits, the
-    loss of an actuator.
+    A fixed value (`MeanWind`, the `factor` of a mismatch) counts as unknown, with its size as standard deviation; two
+    fixed winds are one, as are two factors of one kind, and two loads on one body. A truncated normal distribution
+    counts with its own standard deviation. Losses in bursts count as independent ones, and displaced obstacles as
+    displaced equally along all axes. `left_out` lists, with reasons, the disturbances that the robot's dynamics do not
+    declare, and all that are not small, lasting and linear: pushes, narrower limits, the loss of an actuator.
 
     Args:
       disturbances: as in `simulate`; your own kinds have a method `uncertainty`.
     """
-    parts = list[Uncertainty]()
+    single, parts = list[Disturbance](), list[Uncertainty]()
     for disturbance in as_disturbances(disturbances):
         disturbance.check(plant)
+        for i, other in enumerate(single):
+            if (both := other.together(disturbance)) is not None:
+                single[i] = both
+                break
+        else:
+            single.append(disturbance)
+    for disturbance in single:
         field = f"{type(disturbance).__name__}: uncertainty"
         wanted = "a method that returns an Uncertainty"
         parts.append(check_kind(field, disturbance.uncertainty(plant), Uncertainty, wanted))

@@ -40,8 +40,8 @@ class Effect:
       factors: "mass" or "inertia" -> (K, 1), or "thrust" -> (K, actuators): factors of these parameters of the robot.
       alter: called once, before the first step, with MuJoCo's simulations; `simulations.expand(field)` gives each trial
         its own values of a field of the model; the first axis is the trial. Refused for other simulators.
-      measure: (step, states (K, n)) -> measured states, (K, n), a row of NaN for a measurement that gets lost; step runs
-        to T inclusive.
+      measure: (step, states (K, n)) -> measured states, (K, n), a row of NaN for one that gets lost; step runs to T
+        inclusive.
       read: (step, readings (K, any) by the sensor's name) -> the same with errors; NaN for a reading that gets lost.
         It is called for a controller that reads sensors of the MJCF.
       actuate: (step, controls (K, m)) -> controls at the actuators, before they saturate, (K, m).
@@ -102,6 +102,10 @@ class Disturbance(abc.ABC):
 
     def check(self, plant: Plant) -> None:  # noqa: B027 - most plants can have most disturbances
         """Raise an InputError for a plant that cannot have this disturbance; called before each `start`."""
+
+    def together(self, other: "Disturbance") -> "Disturbance | None":
+        """A single disturbance with the effect of both, if both are fixed values of one kind; None for others."""
+        return None
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         """The disturbance in numbers, for `uncertainty_of`. By default it is left out, with a reason."""

@@ -83,6 +83,12 @@ class Mismatch(Disturbance):
             raise InputError(f"{type(self).__name__}: strength: got {strength:g}, want less: the result overflows")
         return replace(self, factor=float(factor) if factor.ndim == 0 else tuple(factor.tolist()))
 
+    def together(self, other: Disturbance) -> "Mismatch | None":
+        if not isinstance(other, type(self)) or self.factor is None or other.factor is None:
+            return None
+        sizes = {np.size(mismatch.factor) for mismatch in (self, other) if np.ndim(mismatch.factor)}
+        return None if len(sizes) > 1 else replace(self, factor=np.multiply(self.factor, other.factor).tolist())
+
     def spread(self, plant: Plant) -> Array:
         """The standard deviation of each part's factor, (parts,). For a fixed factor, its distance from 1."""
         parts = self.parts(plant)
@@ -160,6 +166,10 @@ class Payload(Disturbance):
             simulations.expand("body_mass")[:, number] += self.mass
 
         return Effect(alter=alter)
+
+    def together(self, other: Disturbance) -> "Payload | None":
+        same = isinstance(other, Payload) and other.body == self.body
+        return replace(self, mass=self.mass + other.mass) if same else None
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         load, total = load_of(plant, self._number(plant)), "mass"
