@@ -17,7 +17,7 @@ from lqrsim import rotations
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.problem import quadratic_cost
 from lqrsim.scenarios.references import resolve
-from lqrsim.simulation.effects import Effect
+from lqrsim.simulation.disturbances.base import Effect
 from lqrsim.stress import statistics
 from lqrsim.stress.failure_search import PrescribedDraws
 from lqrsim.stress.reliability import failure_probability, smallest_failure

@@ -24,7 +24,7 @@ from lqrsim.simulation.disturbances import (
     Saturation,
     TorqueNoise,
 )
-from lqrsim.simulation.effects import seeded
+from lqrsim.simulation.disturbances.base import seeded
 
 DT = 1 / 30
 RESTLESS = MeasurementNoise(1e-3)  # so that no two states or commands are equal

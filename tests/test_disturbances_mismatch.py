@@ -24,8 +24,8 @@ from lqrsim.simulation.disturbances import (
     TorqueNoise,
     WheelRadiusMismatch,
 )
+from lqrsim.simulation.disturbances.base import Effects, seeded
 from lqrsim.simulation.disturbances.mismatch import cut_normal
-from lqrsim.simulation.effects import Effects, seeded
 from lqrsim.simulation.physics import MujocoPhysics
 from lqrsim.simulation.plant import Plant
 

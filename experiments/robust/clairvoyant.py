@@ -25,7 +25,7 @@ from lqrsim.errors import Array
 from lqrsim.problem.parts import terms_of
 from lqrsim.results.archive import sha256
 from lqrsim.results.coordinates import Coordinates
-from lqrsim.simulation.effects import seeded
+from lqrsim.simulation.disturbances.base import seeded
 from robust.common import Reached, reached, run
 
 WEIGHTS = (10.0, 100.0)  # of the obstacles, relative to the problem's own: what is tried for each trial

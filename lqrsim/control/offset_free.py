@@ -135,7 +135,7 @@ class FilterLaw:
     model: PlanModel
     filter: KalmanFilter
     tracking: DeviationLaw
-    in_plan: Array | float = 0.0  # the unknowns' states (D,) with which the plan was made
+    planned_unknowns: Array | float = 0.0  # their states (D,) with which the plan was made
 
     @cached_property
     def absolute(self) -> Policy:
@@ -147,7 +147,7 @@ class FilterLaw:
     def nominal(self) -> Array:
         """z in an undisturbed run, (T+1, Z)."""
         states, reached = self.model.plan.states, self.model.reached
-        unknowns = np.zeros((len(states), len(self.model.transition))) + self.in_plan
+        unknowns = np.zeros((len(states), len(self.model.transition))) + self.planned_unknowns
         return np.concatenate([states, reached, unknowns], axis=1)
 
 
@@ -395,7 +395,7 @@ class OffsetFree(Controller):
           InputError: with `replan_every`, which needs a solver; or with sensors of the MJCF, which need MuJoCo.
         """
         self._check_in_advance("policy")
-        return policy_of(self._law)
+        return linear_policy(self._law)
 
     @property
     def digest(self) -> str:
@@ -472,7 +472,7 @@ def _outcome(judge: Judge, systems: list[PlanModel], design: FilterLaw) -> Predi
         return judge.predictions(loop.in_systems(systems, design.model.n))
 
 
-def policy_of(law: FilterLaw) -> OutputFeedbackPolicy:
+def linear_policy(law: FilterLaw) -> OutputFeedbackPolicy:
     """The law as an `OutputFeedbackPolicy`, linear about the plan.
 
     Commands under way are part of the state, and advance by one place in each period. If measurements are late by k
@@ -601,8 +601,8 @@ class ReplannedRun(ControllerRun):
         modelled = (model.output != 0).any(axis=0) & ~on_controls
         for unknown, states in zip(model.remembered, model.unknown_states, strict=True):
             modelled[list(states)] &= unknown.constant
-        in_plan = np.where(modelled, z[n + model.lagging :], 0.0)
-        changes = model.output[: len(model.parameters)] @ in_plan
+        planned = np.where(modelled, z[n + model.lagging :], 0.0)
+        changes = model.output[: len(model.parameters)] @ planned
         values = {
             name: float(model.dynamics.parameters[name] + change)
             for name, change in zip(model.parameters, changes, strict=True)
@@ -615,8 +615,8 @@ class ReplannedRun(ControllerRun):
             return
         # In that model the actuators have no lag, gains or offsets.
         gain, reached = law.absolute.gain[done:], law.nominal[done:-1, n : n + model.lagging]
-        fixed = np.concatenate([reached, np.tile(in_plan, (len(gain), 1))], axis=1)
-        offset = law.absolute.offset[done:] + np.einsum("tij,tj->ti", gain[:, :, n:], fixed)
+        without_state = np.concatenate([reached, np.tile(planned, (len(gain), 1))], axis=1)
+        offset = law.absolute.offset[done:] + np.einsum("tij,tj->ti", gain[:, :, n:], without_state)
         here = dynamics.state_coordinates.nearest(z[:n], law.nominal[done, :n])
         gain = in_c_order(gain[:, :, :n])
         if not self._always and self._leads_to_goal(problem, gain, offset, here):
@@ -632,7 +632,7 @@ class ReplannedRun(ControllerRun):
         # The filter begins with a measurement that has been used already.
         kalman = kalman_filter(about, law.filter.corrected_root[done])
         weights = replace(law.tracking.weights, emphasis=None)  # that of another plan
-        run.law, run.begins_at = FilterLaw(solution, about, kalman, tracking_law(about, weights), in_plan), step
+        run.law, run.begins_at = FilterLaw(solution, about, kalman, tracking_law(about, weights), planned), step
 
 
 class Estimate(NamedTuple):

@@ -424,19 +424,13 @@ def kalman_filter(model: PlanModel, known: Array | None = None) -> KalmanFilter:
     _, before, after, innovation_root, correction_root, _ = roots
     limit = PLAUSIBLE * np.sqrt((correction_root[:, n + model.lagging :] ** 2).sum(axis=2))
     predicted, corrected, innovation = (root @ root.transpose(0, 2, 1) for root in (before, after, innovation_root))
-    return KalmanFilter(_gains(correction_root, innovation_root), predicted, corrected, after, innovation, limit)
-
-
-def _gains(correction_root: Array, root: Array) -> Array:
-    """The K of K S = `correction_root` (T+1, Z, Y), for lower triangular S = `root` (T+1, Y, Y), at all knots at once.
-
-    By substitution: OpenBLAS solves even such small systems with all its threads, which then wait for each other.
-    """
+    # The K of K innovation_root = correction_root at all knots, by substitution, for the roots are lower triangular.
+    # OpenBLAS solves even such small systems with all its threads, which then wait for each other.
     gain = np.empty_like(correction_root)
-    for j in range(root.shape[1] - 1, -1, -1):
-        solved = (gain[:, :, j + 1 :] @ root[:, j + 1 :, j, None])[:, :, 0]
-        gain[:, :, j] = (correction_root[:, :, j] - solved) / root[:, j, j, None]
-    return gain
+    for j in range(measured - 1, -1, -1):
+        solved = (gain[:, :, j + 1 :] @ innovation_root[:, j + 1 :, j, None])[:, :, 0]
+        gain[:, :, j] = (correction_root[:, :, j] - solved) / innovation_root[:, j, j, None]
+    return KalmanFilter(gain, predicted, corrected, after, innovation, limit)
 
 
 def recursions() -> CompiledModule:

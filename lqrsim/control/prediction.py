@@ -100,9 +100,9 @@ class Surroundings:
         if not self.shapes:
             return np.zeros((len(states), 0)), np.zeros((len(states), 0, len(self.position))), np.zeros(0)
         parts = [shape.with_slopes(states, self.position) for shape in self.shapes]
-        fixed = [obstacle.kind == "plane" for shape in self.shapes for obstacle in shape.world.obstacles]
+        planes = [obstacle.kind == "plane" for shape in self.shapes for obstacle in shape.world.obstacles]
         clearance, normals = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
-        return clearance, normals, np.where(fixed, 0.0, self.std**2)
+        return clearance, normals, np.where(planes, 0.0, self.std**2)
 
     @property
     def by_mujoco(self) -> bool:

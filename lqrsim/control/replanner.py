@@ -134,7 +134,7 @@ class ReplanLog:
         return line
 
 
-def _fixed(problem: Problem) -> dict[str, object]:
+def _unchangeable(problem: Problem) -> dict[str, object]:
     """The parts of a problem that must not change while a plan is in force, by field."""
     names = *problem.dynamics.state_coordinates.names, *problem.dynamics.control_coordinates.names
     return {"dt": problem.dt, "steps": problem.steps, "duration": problem.duration, "dynamics": ", ".join(names)}
@@ -191,8 +191,8 @@ class ReplanRule:
     def checked(self, who: str, problem: Problem) -> Problem:
         """The problem. Raises InputError if it cannot replace the rule's own problem while a plan is in force."""
         check_kind(who, problem, Problem, "a Problem")
-        wanted = _fixed(self.problem)
-        for field, got in _fixed(problem).items():
+        wanted = _unchangeable(self.problem)
+        for field, got in _unchangeable(problem).items():
             if got != (want := wanted[field]):
                 raise InputError(f"{who}: {field}: got {got}, want {want}: it cannot change while a re-planner runs")
         return self.solver.check(problem)

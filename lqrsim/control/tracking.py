@@ -100,7 +100,7 @@ class Weights:
 
 
 class DeviationLaw(NamedTuple):
-    """A law u = gain z + offset in deviations from a plan, or C laws to compare; and the weights that it follows from."""
+    """A law u = gain z + offset in deviations from a plan, or C laws to compare, with their weights."""
 
     gain: Array  # (T, m, Z), or (C, T, m, Z)
     offset: Array  # (T, m), or (C, T, m)
@@ -260,8 +260,8 @@ class Judge:
         extents = np.ptp(self.solution.trajectory.states[:, self.norm.states], axis=0) / self.norm.scale
         return max(float(widths.min()), 1e-3 * (float(extents.max()) or 1.0))
 
-    def strays(self, law: DeviationLaw, moments: LoopMoments, i: int) -> int:
-        """The number of runs under a law, the one of C with these moments, that get too far from the plan, from likely deviations.
+    def strays(self, laws: DeviationLaw, moments: LoopMoments, i: int) -> int:
+        """The number of runs under one of C laws that get too far from the plan, from likely deviations.
 
         The law acts on the true state, in the nonlinear model. If all of these return to the plan, and the law acts on
         measured states and often reaches the limits, trials with unknowns that are drawn count as well.
@@ -269,7 +269,7 @@ class Judge:
         plan, rng, count = self.solution.trajectory, np.random.default_rng(0), 0
         mean, covariance = moments.mean[i], moments.covariance[i]
         farthest, n = FARTHEST * np.sqrt(self.norm.squares(covariance).max()), mean.shape[1]
-        policy = _policy_of(self.solution, law)
+        policy = _absolute_policy(self.solution, laws.pick(i))
         for t in (plan.steps * k // KNOTS for k in range(KNOTS)):
             variances, axes = np.linalg.eigh(covariance[t])
             off = rng.standard_normal((PAIRS, n)) * np.sqrt(np.maximum(variances, 0.0)) @ axes.T
@@ -305,7 +305,7 @@ def choose_tolerances(judge: Judge, model: PlanModel, effort: Array, at_end: flo
     scores = predicted.scores(least)
     strays = dict[int, int]()  # the number of runs that stray under each law
     for best in sorted(range(len(scores)), key=lambda i: (scores[i], -i)):  # of equals the gentlest first
-        strays[best] = judge.strays(tried.pick(best), moments, best)
+        strays[best] = judge.strays(tried, moments, best)
         if not strays[best]:
             break
     else:
@@ -329,7 +329,7 @@ def choose_tolerances(judge: Judge, model: PlanModel, effort: Array, at_end: flo
     moments = judge.moments(stressed)
     stressed_scores = judge.predictions(moments).scores(least)
     i = int(np.argmin(stressed_scores))
-    better = stressed_scores[i] < scores[best] and judge.strays(stressed.pick(i), moments, i) <= strays[best]
+    better = stressed_scores[i] < scores[best] and judge.strays(stressed, moments, i) <= strays[best]
     return stressed.pick(i) if better else chosen
 
 
@@ -398,10 +398,10 @@ def track(
     else:
         judge = Judge(problem, solution, PlanModel(derivatives, uncertainty))
         law = choose_tolerances(judge, model, efforts, at_end, call="track(...)")
-    return _policy_of(solution, law)
+    return _absolute_policy(solution, law)
 
 
-def _policy_of(solution: Solution, law: DeviationLaw) -> AffinePolicy:
+def _absolute_policy(solution: Solution, law: DeviationLaw) -> AffinePolicy:
     """The policy of a law about the solution's plan. The command in force has no effect on a command that arrives."""
     plan = solution.trajectory
     gain, offset = law_about(plan.states, plan.controls + law.offset, law.gain[..., : plan.states.shape[1]])

@@ -1,7 +1,7 @@
 """Running a controller on a plant: one code path for one trial and for many.
 
-`simulate` loops over the control periods; `ClosedLoop` has a method for each phase of a period. `effects.py`
-applies the disturbances, and `physics.py` advances the physics.
+`simulate` loops over the control periods; `ClosedLoop` has a method for each phase of a period. `Effects` of
+`disturbances/base.py` applies the disturbances, and `physics.py` advances the physics.
 """
 
 import copy
@@ -24,10 +24,12 @@ from lqrsim.results.goal import Target
 from lqrsim.results.rollout import GOAL_MOVED, MovingObstacles, Rollout
 from lqrsim.results.solution import Plan
 from lqrsim.results.solution_parts import Trajectory
+from lqrsim.robots.sensors import RobotSensors
 from lqrsim.scenes.mujoco_log import unlogged
 from lqrsim.scenes.world import World
 from lqrsim.simulation.disturbances import Disturbance, as_disturbances
-from lqrsim.simulation.effects import BeliefReadings, Effects, MakeGenerator, Readings, seeded
+from lqrsim.simulation.disturbances.base import Effects, MakeGenerator, seeded
+from lqrsim.simulation.disturbances.noise import DEVIATIONS, READINGS
 from lqrsim.simulation.physics import AnyPhysics, MujocoPhysics, Period, SimulatorPhysics, steps_per_frame
 from lqrsim.simulation.plant import Plant
 from lqrsim.solvers.budget import check_threads
@@ -150,12 +152,6 @@ class Records:
         self.contacts = np.zeros(trials, dtype=np.int64)
         self.invalid_since, self.failed_since = np.full(trials, steps + 1), np.full(trials, steps + 1)
         self.reasons, self.frames = [""] * trials, list[Array]()
-
-    def knot(self, step: int, states: Array, measured: Array, clearance: Array, invalid: Mask) -> None:
-        """Record states (K, n), true and measured, and clearance (K,) at a knot, and which are invalid from here."""
-        self.states[:, step], self.measured[:, step], self.clearance[:, step] = states, measured, clearance
-        if invalid.any():
-            self.invalid_since[invalid] = np.minimum(self.invalid_since[invalid], step)
 
     def end(self, step: int, who: Literal["controller", "filter", "disturbances"], reasons: Mapping[int, str]) -> None:
         """Record that trials end, row -> reason, unless they have before; where it is the controller, they failed."""
@@ -302,6 +298,65 @@ class Collisions:
             self.obstacles[row] = self._passing.world.names[self._passing.nearest(places, moved[0])]
 
 
+class Readings:
+    """What a controller reads of the sensors of an MJCF in K trials, with errors, rates and delays.
+
+    A number is NaN where no reading of its sensor arrives, or it got lost. The run begins at the plan's knot `first`.
+    """
+
+    def __init__(
+        self, sensors: RobotSensors, effects: Effects, physics: AnyPhysics, plan: Trajectory, first: int
+    ) -> None:
+        if not isinstance(physics, MujocoPhysics):
+            raise InputError("controller: got one that reads sensors of the MJCF, want a plant moved by MuJoCo")
+        self._sensors, self._effects, self._physics, self._plan = sensors, effects, physics, plan
+        self._first, self._late, self._readings = first, sensors.delay_periods(plan.dt), dict[int, Array]()
+
+    def arriving(self, step: int, states: Array, measured: Array) -> Array:
+        """The readings (K, Y) that arrive at a knot; those before the run begins are exact.
+
+        They are taken under the last controls. Up to the first knot of the run these are the plan's.
+        """
+        sensors, planned = self._sensors, step < self._first
+        held = np.tile(self._plan.controls[max(step - 1, 0)], (len(states), 1))
+        if planned:
+            exact = np.repeat(sensors.reader()(states[:1], held[:1], np.zeros((1, 6))), len(states), axis=0)
+        else:
+            exact = sensors.readings(self._physics.sense(held if step == self._first else None))
+        pairs = zip(sensors.sensors, sensors.columns, strict=True)
+        named = self._effects.read(step, {sensor.name: exact[:, at] for sensor, at in pairs})
+        noisy = np.concatenate([named[sensor.name] for sensor in sensors.sensors], axis=1)
+        self._readings[step] = readings = exact if planned else noisy
+        self._readings.pop(step - max(self._late) - 1, None)
+        out = np.full(readings.shape, np.nan)
+        for i, (at, late) in enumerate(zip(sensors.columns, self._late, strict=True)):
+            if step - late in self._readings and sensors.due(step - late, self._plan.dt)[i]:
+                out[:, at] = self._readings[step - late][:, at]
+        return out
+
+
+class BeliefReadings:
+    """The readings of K trials by the formulas of a belief, in the true states, followed by the states that it knows.
+
+    `ReadingErrors` adds the noise of the readings. The run begins at the plan's knot `first`.
+    """
+
+    def __init__(self, belief: Belief, effects: Effects, first: int) -> None:
+        self.belief, self._effects, self._first, self._readings = belief, effects, first, list[Array]()
+
+    def arriving(self, step: int, states: Array, measured: Array) -> Array:
+        """The readings (K, Y) that arrive in the true states (K, n), NaN for lost ones; and measured known states.
+
+        Those before the run begins are exact.
+        """
+        exact, deviations = self.belief.read(states)
+        noisy = self._effects.read(step, {READINGS: exact, DEVIATIONS: deviations})[READINGS]
+        self._readings.append(exact if step < self._first else noisy)
+        arrived = len(self._readings) > self.belief.sensors.delay
+        arriving = self._readings.pop(0) if arrived else np.full_like(exact, np.nan)
+        return np.hstack([arriving, measured[:, self.belief.known]])
+
+
 @checked
 @dataclass(kw_only=True, eq=False, repr=False)
 class ClosedLoop:
@@ -433,9 +488,11 @@ class ClosedLoop:
 
     def measure(self, step: int) -> Array:
         measured, self.lost = self.effects.measure(self.knot + step, self.states)
-        invalid = self.physics.unstable | _not_finite(self.states) | _not_finite(measured)
-        self.records.knot(step, self.states, measured, self.collisions.clearance, invalid)
-        over = self.records.over(step)
+        records, invalid = self.records, self.physics.unstable | _not_finite(self.states) | _not_finite(measured)
+        records.states[:, step], records.measured[:, step] = self.states, measured
+        records.clearance[:, step] = self.collisions.clearance
+        records.invalid_since[invalid] = np.minimum(records.invalid_since[invalid], step)
+        over = records.over(step)
         if over.any():  # trials that have ended continue in the plan's states, so as not to disturb the others
             measured[over] = self.trajectory.states[step]
         return measured

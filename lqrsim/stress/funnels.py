@@ -31,7 +31,7 @@ from lqrsim.results.goal import Target
 from lqrsim.results.solution import Solution
 from lqrsim.simulation.closed_loop import simulate_from
 from lqrsim.simulation.disturbances import Disturbance, InitialStateError, as_disturbances
-from lqrsim.simulation.effects import seeded
+from lqrsim.simulation.disturbances.base import seeded
 from lqrsim.simulation.plant import Plant
 from lqrsim.solvers.budget import check_threads
 from lqrsim.stress.statistics import CONFIDENCE, Estimate
