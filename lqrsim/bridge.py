@@ -250,6 +250,8 @@ class SimulatedRobot:
                 labels = [dimension.label for dimension in message.layout.dim]
                 if label in labels or not any(other.startswith(ANSWERS) for other in labels):
                     answer.append(message)
+                elif not begins:
+                    self._command = message.data
             return bool(answer) or ended
 
         _wait(answered_or_ended, self._patience, lambda: f"commands: got no command on {self._topic}")

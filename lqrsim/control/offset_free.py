@@ -648,7 +648,7 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SensorFilter:
-    """The filter about a plan."""
+    """The filter about a plan: what its design and its runs, `SensorRun`, share. It keeps no estimates."""
 
     model: PlanModel  # the linear model that the filter assumes
     sensors: RobotSensors

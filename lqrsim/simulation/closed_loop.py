@@ -552,9 +552,11 @@ class ClosedLoop:
             physics.rerun_with_contacts(begun, period)
             self.collisions.relocate(period.states[-1])
         if physics.solid.any():
-            records.contacts += physics.touched(period) & ~over
+            touched = np.any([touching.any(axis=1) for touching in period.touching], axis=0)
+            records.contacts += physics.solid & touched & ~over
         self.states = period.states[-1]
-        for frame in physics.drawn(period) if self.frames else ():
+        every = physics.parts // physics.drawn_parts
+        for frame in period.frames[every - 1 :: every] if self.frames else ():
             time = len(records.frames) * records.plan.dt / physics.drawn_parts
             records.frames.append(frame)
             if watch is not None:

@@ -51,17 +51,9 @@ class Physics(abc.ABC):
         per_frame = steps_per_frame(plant, substeps)
         self.plant, self._part = plant, 1 if each_step else per_frame
         self.parts, self.drawn_parts = substeps // self._part, substeps // per_frame
-        self._every = self.parts // self.drawn_parts
         self.unstable: npt.NDArray[np.bool_] = np.zeros(trials, dtype=bool)
         self.solid: npt.NDArray[np.bool_] = np.zeros(trials, dtype=bool)
         self.warnings: npt.NDArray[np.int64] = np.zeros((trials, len(WARNINGS)), dtype=np.int64)
-
-    def drawn(self, period: Period) -> list[Array]:
-        return period.frames[self._every - 1 :: self._every]
-
-    def touched(self, period: Period) -> npt.NDArray[np.bool_]:
-        """Whether each trial with solid obstacles touched one, (K,)."""
-        return self.solid & np.any([touching.any(axis=1) for touching in period.touching], axis=0)
 
     @abc.abstractmethod
     def state(self) -> Array: ...
@@ -133,10 +125,6 @@ class MujocoPhysics(Physics):
         }[parameter]
         values = self.simulations.expand(field)
         values[:, which] *= factors if values.ndim == 2 else factors[:, :, None]
-
-    def alter(self, name: str, change: Callable[[batch.Batch], None]) -> None:
-        """Let a disturbance of this name change the models."""
-        change(self.simulations)
 
     def displace(self, displaced: Array) -> None:
         """Move the obstacles by (K, obstacles, 3) m, in the world's axes."""
@@ -269,9 +257,6 @@ class SimulatorPhysics(Physics):
     def multiply(self, parameter: str, factors: Array) -> None:
         self.plant.check_simulator(parameter, parameter)
         self._factors[parameter] = self._factors.get(parameter, 1.0) * factors
-
-    def alter(self, name: str, change: Callable[[batch.Batch], None]) -> None:
-        self.plant.check_simulator(name)
 
     def displace(self, displaced: Array) -> None:
         """Do nothing: collisions are computed from the positions of the obstacles."""

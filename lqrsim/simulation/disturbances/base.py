@@ -31,7 +31,7 @@ from lqrsim.errors import (
 )
 from lqrsim.results.coordinates import Coordinates, PerEntry
 from lqrsim.results.solution_parts import Trajectory
-from lqrsim.simulation.physics import AnyPhysics
+from lqrsim.simulation.physics import AnyPhysics, MujocoPhysics
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.simulator import PARAMETERS
 
@@ -273,7 +273,9 @@ class Effects:
                 shape = len(self.displaced), columns
                 physics.multiply(parameter, shaped(f"{name}: factors: {parameter}", factors, shape))
             if effect.alter is not None:
-                physics.alter(name, effect.alter)
+                physics.plant.check_simulator(name)
+                assert isinstance(physics, MujocoPhysics)
+                effect.alter(physics.simulations)
         moved = bool(self.displaced.any())
         if moved:
             physics.displace(self.displaced)
