@@ -507,15 +507,15 @@ def linear_policy(law: FilterLaw) -> OutputFeedbackPolicy:
             onto[:, first + i * m : first + (i + 1) * m] += G[j]
         at = min(t + delay, steps - 1)
         arrays["gain"][t], arrays["offset"][t] = gain[at] @ onto, gain[at] @ constant + offset[at]
-        transition, given, commands = arrays["transition"][t], arrays["input"][t], width - size
+        transition, by_command, commands = arrays["transition"][t], arrays["input"][t], width - size
         transition[:size, :size] = F[knot] if t >= latency else np.eye(size)  # z waits for the first measurement
         if t >= latency:
             arrays["correction"][t, :size], arrays["drift"][t, :size] = law.filter.gain[knot], f[knot]
-            acting = transition[:size, size : size + m] if commands else given[:size]  # the oldest command
+            acting = transition[:size, size : size + m] if commands else by_command[:size]  # the oldest command
             acting[:] = G[knot]
         if commands:  # all move up, and the new one is the last
             transition[size:-m, size + m :] = np.eye(commands - m)
-            given[-m:] = np.eye(m)
+            by_command[-m:] = np.eye(m)
     return OutputFeedbackPolicy(
         **arrays, dt=plan.dt, state_coordinates=law.plan.policy.state_coordinates,
         control_coordinates=law.plan.policy.control_coordinates,

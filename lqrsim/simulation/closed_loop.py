@@ -369,7 +369,7 @@ class ClosedLoop:
       starts: (K, n), where the trials begin; by default in the plan's first state. knot: number of the plan's knot at
         which they begin. Both are for `simulate_from`.
       active_disturbances: the disturbances, each `Noise` as a StateNoise.
-      law: the controller, by default the plan's policy.
+      active_controller: the controller, by default the plan's policy.
       remaining_plan: the plan of the run, the given one or else the controller's own, from the knot on.
       trajectory: its trajectory.
       state_coordinates, control_coordinates: those of the controller, with limits within the robot's limits.
@@ -404,8 +404,8 @@ class ClosedLoop:
         plant, trials = self.plant, self.trials
         self.active_disturbances = as_disturbances(self.disturbances)
         threads = check_threads(self.threads)
-        self.law, plan = as_controller(self.controller, self.plan, plant.robot.dynamics)
-        self.state_coordinates, self.control_coordinates = _checked_coordinates(self.law, plan, plant)
+        self.active_controller, plan = as_controller(self.controller, self.plan, plant.robot.dynamics)
+        self.state_coordinates, self.control_coordinates = _checked_coordinates(self.active_controller, plan, plant)
         full = plan.trajectory
         if self.knot >= full.steps:
             raise InputError(f"knot: got {self.knot}, want one from 0 to {full.steps - 1}, before the plan's end")
@@ -431,7 +431,7 @@ class ClosedLoop:
             self.physics = MujocoPhysics(plant, trials, substeps, contacts=self.contacts, threads=threads)
         self.physics.place(self.effects.initial_states(np.tile(full.states[0], (trials, 1)), self.starts))
         self.physics.prepare(altered=self.effects.alter_models(self.physics))
-        name, run = f"{type(self.law).__name__}.start", self.law.start(trials)
+        name, run = f"{type(self.active_controller).__name__}.start", self.active_controller.start(trials)
         self.controller_run = check_kind(name, run, ControllerRun, "a ControllerRun returned")
         self.records = Records(self.trajectory, trials)
         self.records.frames.append(self.physics.frame())
@@ -439,7 +439,7 @@ class ClosedLoop:
         self.collisions = Collisions(plant, self.states, self.effects.displaced, dt, passing)
         space = plant.robot.dynamics.control_coordinates
         self._names, self._limits = space.names, space.limits
-        sensors = self.law.sensors
+        sensors = self.active_controller.sensors
         self._readings: Readings | BeliefReadings | None = None
         if isinstance(sensors, Belief):
             self._readings = BeliefReadings(sensors, self.effects, self.knot)
@@ -503,7 +503,7 @@ class ClosedLoop:
         observed, knot = measured, self.knot + step
         if self._readings is not None:
             observed = self._readings.arriving(knot, self.states, measured)
-        elif self.law.sees_losses:
+        elif self.active_controller.sees_losses:
             observed = np.where(self.lost[:, None], np.nan, measured)
         try:
             commands = shaped("commands", self.controller_run.control(knot, observed), shape)
@@ -579,7 +579,7 @@ class ClosedLoop:
         plant, plan, records = self.plant, self.remaining_plan, self.records
         if self.moving is not None:
             return None
-        if not self.active_disturbances and self.law.digest == plan.policy.digest:
+        if not self.active_disturbances and self.active_controller.digest == plan.policy.digest:
             records.turn_to_plan(self.state_coordinates)
             ended = min(self.collisions.at[0], records.time_of(records.invalid_since)[0])
             return np.where(plan.trajectory.times[:, None] < ended, records.states[0], np.nan)
@@ -601,10 +601,10 @@ class ClosedLoop:
         plant, plan, parts = self.plant, self.trajectory, self.physics.drawn_parts
         goal, radius = self.remaining_plan.goal, self._radius
         if (moved := self.controller_run.moved_goal()) is not None:
-            # A radius that was given holds for another goal only in the same unit.
+            # A radius by argument holds for another goal only in the same unit.
             target = replace(self._target, goal=moved)
-            given = (self.goal_radius, self.goal_tolerance) if target.unit == self._target.unit else (None, None)
-            goal, radius = moved, target.radius(plant.robot.radius, *given)
+            stated = (self.goal_radius, self.goal_tolerance) if target.unit == self._target.unit else (None, None)
+            goal, radius = moved, target.radius(plant.robot.radius, *stated)
         described = (disturbance.describe(plant) for disturbance in self.active_disturbances)
         changed = () if moved is None else (GOAL_MOVED,)
         begun = () if self.starts is None else ("given first states",)
@@ -613,12 +613,13 @@ class ClosedLoop:
         frames = records.finish(parts, all_frames=self.frames)
         return Rollout(
             robot=plant.robot.name, body=plant.robot.body, radius=plant.robot.radius, scene=plant.scene.name,
-            model=plant.scene.xml, plan=plan, policy_digest=self.law.digest, state_coordinates=self.state_coordinates,
-            control_coordinates=self.control_coordinates, goal=goal, goal_radius=radius, states=records.states,
-            measured=records.measured, commanded=records.commanded, applied=records.applied,
-            forces=records.wrench[..., :3], torques=records.wrench[..., 3:], displaced=self.effects.displaced,
-            clearance=records.clearance, contacts=records.contacts, collided_at=collisions.at,
-            obstacles=tuple(collisions.obstacles), diverged_at=records.time_of(records.invalid_since),
+            model=plant.scene.xml, plan=plan, policy_digest=self.active_controller.digest,
+            state_coordinates=self.state_coordinates, control_coordinates=self.control_coordinates, goal=goal,
+            goal_radius=radius, states=records.states, measured=records.measured, commanded=records.commanded,
+            applied=records.applied, forces=records.wrench[..., :3], torques=records.wrench[..., 3:],
+            displaced=self.effects.displaced, clearance=records.clearance, contacts=records.contacts,
+            collided_at=collisions.at, obstacles=tuple(collisions.obstacles),
+            diverged_at=records.time_of(records.invalid_since),
             failed_at=records.time_of(records.failed_since), reasons=tuple(records.reasons), frames=frames,
             frame_times=np.arange(frames.shape[1]) * (plan.dt / parts), seed=self.seed, first_trial=self.first_trial,
             disturbances=(*described, *begun, *passing, *changed), controller_run=self.controller_run,

@@ -251,16 +251,16 @@ class Effects:
         hooks = [(name, getattr(effect, kind)) for name, effect in effects or self._effects]
         return [(f"{name}: {kind}: returned", hook) for name, hook in hooks if hook is not None]
 
-    def initial_states(self, planned: Array, given: Array | None = None) -> Array:
-        """The first states (K, n) of the trials, from the plan's; or given ones, which no disturbance may change."""
+    def initial_states(self, planned: Array, starts: Array | None = None) -> Array:
+        """The first states (K, n) of the trials, from the plan's; or `starts`, which no disturbance may change."""
         states = planned
         for name, effect in self._effects:
             if effect.initial_states is None:
                 continue
             states = shaped(f"{name}: initial_states: returned", effect.initial_states(states.copy()), planned.shape)
-            if given is not None and not np.array_equal(states, planned):
+            if starts is not None and not np.array_equal(states, planned):
                 raise InputError(f"disturbances: got {name}, which changes the start, want others: states are given")
-        states = states if given is None else given
+        states = states if starts is None else starts
         if not np.isfinite(states).all():
             raise InputError("disturbances: got an infinite first state, want finite numbers")
         return states
