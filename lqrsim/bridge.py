@@ -236,11 +236,13 @@ class SimulatedRobot:
         self._command = None if begins else commands[-1]
         writers, answer = inlet.writers(), list[Any]()
         self._t, begun = t, time.monotonic()
-        for kind, outlet in self._outlets.items():
-            is_odometry = kind == "Odometry"
-            published = node.odometry(values, t, self._turns_about) if is_odometry else node.joints(values, t)
-            outlet.write(published)
-        label = _label_of([published])
+        published = [
+            node.odometry(values, t, self._turns_about) if kind == "Odometry" else node.joints(values, t)
+            for kind in self._outlets
+        ]
+        for outlet, message in zip(self._outlets.values(), published, strict=True):
+            outlet.write(message)
+        label = _label_of(published)
 
         def answered_or_ended() -> bool:
             ended = set(writers).isdisjoint(inlet.writers())  # before receiving what it last sent

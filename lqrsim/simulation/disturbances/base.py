@@ -300,7 +300,7 @@ class Effects:
         for name, measure in self._measures:
             measured = shaped(name, measure(step, measured), measured.shape)
         if self._measures:
-            lost = np.isnan(measured).all(axis=1)
+            lost |= np.isnan(measured).all(axis=1)
             measured = self._arrived = np.where(lost[:, None], self._arrived, measured)
         return measured.copy(), lost
 

@@ -86,8 +86,9 @@ class Mismatch(Disturbance):
     def together(self, other: Disturbance) -> "Mismatch | None":
         if not isinstance(other, type(self)) or self.factor is None or other.factor is None:
             return None
-        sizes = {np.size(mismatch.factor) for mismatch in (self, other) if np.ndim(mismatch.factor)}
-        return None if len(sizes) > 1 else replace(self, factor=np.multiply(self.factor, other.factor).tolist())
+        one, another = np.asarray(self.factor), np.asarray(other.factor)
+        unlike = one.ndim and another.ndim and len(one) != len(another)
+        return None if unlike else replace(self, factor=(one * another).tolist())
 
     def spread(self, plant: Plant) -> Array:
         """The standard deviation of each part's factor, (parts,). For a fixed factor, its distance from 1."""
@@ -168,8 +169,9 @@ class Payload(Disturbance):
         return Effect(alter=alter)
 
     def together(self, other: Disturbance) -> "Payload | None":
-        same = isinstance(other, Payload) and other.body == self.body
-        return replace(self, mass=self.mass + other.mass) if same else None
+        if not isinstance(other, Payload) or other.body != self.body:
+            return None
+        return replace(self, mass=self.mass + other.mass)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
         load, total = load_of(plant, self._number(plant)), "mass"
