@@ -274,7 +274,7 @@ def on_board(law: CompiledLaw, rollout: ls.Rollout, solution: ls.Solution, folde
     """What the law takes on the emulated board along a run, and its commands beside the host's and Python's."""
     measured, commanded = rollout.measured[0, :-1].astype(np.float32), rollout.commanded[0]
     assert isinstance(rollout.controller_run, _Run)
-    lost = np.isnan(rollout.controller_run.shown).all(axis=2)[:, 0].astype(int)
+    lost = [int(np.isnan(shown[0]).all()) for shown in rollout.controller_run.shown]
     if isinstance(law.policy, OutputFeedbackPolicy):
         measured = measured[:, OutputFeedback(law.policy).measures]
     rows = ",\n".join("{" + ", ".join(f"{value!s}f" for value in row) + "}" for row in measured)
