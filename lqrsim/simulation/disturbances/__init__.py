@@ -140,7 +140,7 @@ def uncertainty_of(plant: Plant, disturbances: Sequence[Disturbance | Noise]) ->
     for disturbance in as_disturbances(disturbances):
         disturbance.check(plant)
         for i, other in enumerate(single):
-            if (both := other.together(disturbance)) is not None:
+            if (both := other._together(disturbance)) is not None:
                 single[i] = both
                 break
         else:

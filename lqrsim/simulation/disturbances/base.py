@@ -121,7 +121,7 @@ class Disturbance(abc.ABC):
     def check(self, plant: Plant) -> None:  # noqa: B027 - most plants can have most disturbances
         """Raise an InputError for a plant that cannot have this disturbance; called before each `start`."""
 
-    def together(self, other: "Disturbance") -> "Disturbance | None":
+    def _together(self, other: "Disturbance") -> "Disturbance | None":
         """A single disturbance with the effect of both, if both are fixed values of one kind; None for others."""
         return None
 

@@ -83,7 +83,7 @@ class Mismatch(Disturbance):
             raise InputError(f"{type(self).__name__}: strength: got {strength:g}, want less: the result overflows")
         return replace(self, factor=float(factor) if factor.ndim == 0 else tuple(factor.tolist()))
 
-    def together(self, other: Disturbance) -> "Mismatch | None":
+    def _together(self, other: Disturbance) -> "Mismatch | None":
         if not isinstance(other, type(self)) or self.factor is None or other.factor is None:
             return None
         one, another = np.asarray(self.factor), np.asarray(other.factor)
@@ -168,7 +168,7 @@ class Payload(Disturbance):
 
         return Effect(alter=alter)
 
-    def together(self, other: Disturbance) -> "Payload | None":
+    def _together(self, other: Disturbance) -> "Payload | None":
         if not isinstance(other, Payload) or other.body != self.body:
             return None
         return replace(self, mass=self.mass + other.mass)

@@ -59,7 +59,7 @@ class MeanWind(Wind):
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
         return self.blow(np.broadcast_to(self.velocity, (len(generators), plan.steps, 3)))
 
-    def together(self, other: Disturbance) -> "MeanWind | None":
+    def _together(self, other: Disturbance) -> "MeanWind | None":
         return MeanWind(np.add(self.velocity, other.velocity).tolist()) if isinstance(other, MeanWind) else None
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
