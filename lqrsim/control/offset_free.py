@@ -155,8 +155,7 @@ class FilterRun(ControllerRun):
     """A run of `OffsetFree` with K trials: their estimates z (K, Z) at the knot of the newest measurement.
 
     If measurements are late by k periods, the filter runs k periods behind. Its estimate is predicted forward with the
-    commands since, to the time at which the next command acts. The law's plan begins at the step
-    `begins_at`.
+    commands since, to the time at which the next command acts. The law's plan begins at the step `begins_at`.
     """
 
     def __init__(self, law: FilterLaw, trials: int, record: bool) -> None:

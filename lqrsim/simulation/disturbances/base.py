@@ -121,10 +121,6 @@ class Disturbance(abc.ABC):
     def check(self, plant: Plant) -> None:  # noqa: B027 - most plants can have most disturbances
         """Raise an InputError for a plant that cannot have this disturbance; called before each `start`."""
 
-    def _together(self, other: "Disturbance") -> "Disturbance | None":
-        """A single disturbance with the effect of both, if both are fixed values of one kind; None for others."""
-        return None
-
     def uncertainty(self, plant: Plant) -> Uncertainty:
         """The disturbance in numbers, for `uncertainty_of`. By default it is left out, with a reason."""
         return self._left_out(plant, f"{type(self).__name__} does not override `uncertainty`")
@@ -134,6 +130,10 @@ class Disturbance(abc.ABC):
         """The effect on a run of K trials, one per generator, from which alone its random numbers must come."""
 
     # For `uncertainty`.
+
+    def _together(self, other: "Disturbance") -> "Disturbance | None":
+        """A single disturbance with the effect of both, if both are fixed values of one kind; None for others."""
+        return None
 
     def _left_out(self, plant: Plant, why: str, *, acts: bool = True) -> Uncertainty:
         """No linear model represents it: its description and the reason, if it acts."""
