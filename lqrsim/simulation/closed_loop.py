@@ -580,7 +580,6 @@ class ClosedLoop:
         if self.moving is not None:
             return None
         if not self.active_disturbances and self.active_controller.digest == plan.policy.digest:
-            records.turn_to_plan(self.state_coordinates)
             ended = min(self.collisions.at[0], records.time_of(records.invalid_since)[0])
             return np.where(plan.trajectory.times[:, None] < ended, records.states[0], np.nan)
         if not plant.robot.dynamics.by_mujoco or plant.simulator is not None:
@@ -596,8 +595,9 @@ class ClosedLoop:
 
     def rollout(self, *, undisturbed: bool = False) -> Rollout:
         """A Rollout of all records; if asked for, with the states of an undisturbed run."""
-        alone = self.run_undisturbed() if undisturbed else None
         records, collisions = self.records, self.collisions
+        records.turn_to_plan(self.state_coordinates)
+        alone = self.run_undisturbed() if undisturbed else None
         plant, plan, parts = self.plant, self.trajectory, self.physics.drawn_parts
         goal, radius = self.remaining_plan.goal, self._radius
         if (moved := self.controller_run.moved_goal()) is not None:
@@ -609,7 +609,6 @@ class ClosedLoop:
         changed = () if moved is None else (GOAL_MOVED,)
         begun = () if self.starts is None else ("given first states",)
         passing = () if self.moving is None else (f"moving obstacles {', '.join(self.moving.names)}",)
-        records.turn_to_plan(self.state_coordinates)
         frames = records.finish(parts, all_frames=self.frames)
         return Rollout(
             robot=plant.robot.name, body=plant.robot.body, radius=plant.robot.radius, scene=plant.scene.name,
