@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from runner import Result, Settings, at_most, opening, run, table
 
-from lqrsim.scenes.mjcf_text import MODELS, names
+from lqrsim.scenes.mjcf_model import MODELS, names
 
 WAYS = {"mujoco": "mujoco.MjModel.from_xml_path", "robot": "ls.MjcfRobot"}
 CODE = """

@@ -23,7 +23,7 @@ from runner import Result, Settings, opening, progress, run, table
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.scenes.mjcf_text import read_mjcf
+from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.scene import scene_from_xml
 
 WAY = 1.0  # rad of the first joint
@@ -54,7 +54,7 @@ class Config(Settings):
 
 
 def main(config: Config) -> Result:
-    arms = [(path.stem, read_mjcf(path)[1], config.site) for path in config.models]
+    arms = [(path.stem, MjcfModel.of_file(path).xml, config.site) for path in config.models]
     result = opening(config)
     result["rows"] = [reached(config, *arm) for arm in progress(arms or [("arm of six hinges", ARM, "hand")], "arms")]
     return result

@@ -16,7 +16,7 @@ import sys
 import sysconfig
 import types
 import warnings
-from collections.abc import Callable, Collection, Container, Iterable, Mapping
+from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -398,6 +398,11 @@ def excerpt(value: object) -> str:
         return f"a {type(value).__name__}"
     text = printable(text[:200])
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def listed(names: Sequence[str], most: int = 12) -> str:
+    """Names in a line, or none; only the first ones if there are many."""
+    return (", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")) or "none"
 
 
 def brief(value: object, depth: int = 0) -> str:

@@ -20,7 +20,7 @@ from funnels_by_hand import funnel_by_hand
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.results.rollout import MovingObstacles
-from lqrsim.scenes.mjcf_text import model_from_xml
+from lqrsim.scenes.mjcf_model import model_from_xml
 from lqrsim.view.recorded_trial import RecordedTrial
 
 TRIALS = 8

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from lqrsim import robots
 from lqrsim.errors import InputError
 from lqrsim.robots.packaged import DifferentialDrive, Quadrotor
-from lqrsim.scenes.mjcf_text import names
+from lqrsim.scenes.mjcf_model import names
 from lqrsim.scenes.scene import load_scene
 from lqrsim.simulation.plant import Plant
 from lqrsim.simulation.plant_check import check_plant

@@ -15,7 +15,7 @@ from tracking import hover
 
 import lqrsim as ls
 from lqrsim.cli import main
-from lqrsim.scenes.mjcf_text import model_from_xml
+from lqrsim.scenes.mjcf_model import model_from_xml
 from lqrsim.simulation.disturbances import Push
 from lqrsim.view import exports
 from lqrsim.view.recorded_trial import RecordedTrial

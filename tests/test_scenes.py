@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from lqrsim.errors import InputError
 from lqrsim.robots.mjcf import MjcfRobot
-from lqrsim.scenes.mjcf_text import MODELS, MOST, names
+from lqrsim.scenes.mjcf_model import MODELS, MOST, names
 from lqrsim.scenes.scene import load_scene, scene_from_xml
 
 # method.md, section 4, in metres

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 import lqrsim as ls
-from lqrsim.scenes.mjcf_text import read_mjcf
+from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.scene import scene_from_xml
 
 ARMS, HANDS = "models/assets/robots/", "models/assets/grippers/"
@@ -70,16 +70,15 @@ class FamilyTask:
         assert self.path is not None
         if not self.post and not self.excluded:
             return ls.MjcfRobot(self.path)
-        name, xml = read_mjcf(self.path)
-        added = ""
+        mjcf, added = MjcfModel.of_file(self.path), ""
         if self.post:
             x, y, z, radius, half = self.post
             size = f'pos="{x} {y} {z}" size="{radius} {half}"'
             added += f'<worldbody><geom name="post" type="cylinder" {size} rgba=".2 .4 .6 1"/></worldbody>'
         for one, other in self.excluded:
             added += f'<contact><exclude body1="{one}" body2="{other}"/></contact>'
-        xml = xml.replace("</mujoco>", f"{added}</mujoco>")
-        return ls.MjcfRobot(scene_from_xml(xml, name, obstacles=("post",) if self.post else ()))
+        xml = mjcf.xml.replace("</mujoco>", f"{added}</mujoco>")
+        return ls.MjcfRobot(scene_from_xml(xml, mjcf.name, obstacles=("post",) if self.post else ()))
 
     def problem(self, robot: ls.MjcfRobot) -> ls.Problem:
         """From rest at the start to the goal."""
@@ -113,13 +112,13 @@ class ShelfTask(FamilyTask):
 
     def robot(self) -> ls.MjcfRobot:
         assert self.path is not None
-        name, xml = read_mjcf(self.path)
-        root, size = ElementTree.fromstring(xml), [f"{number:g}" for number in self.board]
+        mjcf = MjcfModel.of_file(self.path)
+        root, size = ElementTree.fromstring(mjcf.xml), [f"{number:g}" for number in self.board]
         (hand,) = root.iterfind(f".//body[@name='{self.hand}']")
         ElementTree.SubElement(hand, "site", {"name": "tool", "pos": "0 0 0.1"})
         box = {"name": "board", "type": "box", "pos": " ".join(size[:3]), "size": " ".join(size[3:])}
         ElementTree.SubElement(ElementTree.SubElement(root, "worldbody"), "geom", box | {"rgba": ".2 .4 .6 1"})
-        return ls.MjcfRobot(scene_from_xml(ElementTree.tostring(root, "unicode"), name, obstacles=("board",)))
+        return ls.MjcfRobot(scene_from_xml(ElementTree.tostring(root, "unicode"), mjcf.name, obstacles=("board",)))
 
     def problem(self, robot: ls.MjcfRobot) -> ls.Problem:
         start, nv, weights = robot.at(), robot.scene.model.nv, np.zeros(2 * robot.scene.model.nv)

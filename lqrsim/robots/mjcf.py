@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,7 @@ from lqrsim.errors import (
     check_number,
     check_weights,
     excerpt,
+    listed,
     renamed,
     vectors_of,
 )
@@ -35,10 +36,10 @@ from lqrsim.problem.state_bounds import LimitCost, StateBounds
 from lqrsim.results.coordinates import Coordinates, PerEntry
 from lqrsim.robots.base import Robot, configuration_of
 from lqrsim.rotations import AXES
-from lqrsim.scenes.mjcf_holding import Holding, at_rest, efforts, falling, holding
-from lqrsim.scenes.mjcf_kinematics import Equalities, contacts_of, leaders_of, position_of, reach_of
+from lqrsim.scenes.mjcf_holding import Holding, at_rest, falling, holding
+from lqrsim.scenes.mjcf_kinematics import Equalities, contacts_of, leaders_of, reach_of
 from lqrsim.scenes.mjcf_model import FAR_PAST, MjcfModel
-from lqrsim.scenes.mjcf_text import listed
+from lqrsim.scenes.mujoco_log import mujoco
 from lqrsim.scenes.scene import (
     Choice,
     Scene,
@@ -133,17 +134,13 @@ class MjcfRobot(Robot):
     ) -> None:
         mjcf = file.mjcf if isinstance(file, Scene) else MjcfModel.of_file(file)
         self.name, who = mjcf.name, f"MjcfRobot {mjcf.name}"
-        if mjcf.turns_about != turns_about:
-            mjcf = replace(mjcf, turns_about=turns_about)
-        mjcf = mjcf.named().lit()
-        if mocap is not None:
-            mjcf = mjcf.with_mocap(mocap, who)
+        self.mjcf = mjcf = mjcf.for_robot(turns_about, mocap, who)
         model, number = mjcf.model, mjcf.body_of(body, who)
         candidates = list(file.geoms) if isinstance(file, Scene) else obstacle_geoms(model)
         every = obstacles is True
         geoms = in_the_way(model, candidates, number, floors=floors) if every else chosen_geoms(model, obstacles, who)
         self._candidates = candidates if floors and every else []
-        self.scene, self.mjcf = scene_of(mjcf, geoms), mjcf
+        self.scene = scene_of(mjcf, geoms)
         self._arguments: dict[str, Any] = {
             "body": body, "position": position, "radius": radius, "outline": outline, "floors": floors,
             "turns_about": turns_about,
@@ -159,7 +156,7 @@ class MjcfRobot(Robot):
         if turns_about is not None and not rotations:
             raise InputError(f"{who}: turns_about: got {turns_about!r} without a free or ball joint, want None")
         turns = [] if turns_about is None else [first + AXES.index(turns_about) for first in rotations]
-        self._axes = position_of(mjcf, number)
+        self._axes = _axes_of(mjcf, number)
         dofs, plane = self._position(position, names, who)
         limits = {joint.dof: joint.limits for joint in mjcf.joints if joint.limits is not None}
         low, high = zip(*(limits.get(i, (-np.inf, np.inf)) for i in range(len(names))), strict=True)
@@ -369,7 +366,7 @@ class MjcfRobot(Robot):
         bounds = self._bounds(start, goal)
         at_start, at_goal = self._held(start), self._held(goal)
         about = (at_start.controls + at_goal.controls) / 2 if at_start.held and at_goal.held else at_start.controls
-        effort = efforts(self.mjcf) ** -2.0 if effort is None else effort
+        effort = self.mjcf.efforts**-2.0 if effort is None else effort
         of_controls = effort if isinstance(effort, Mapping) else check_weights("effort", effort, len(controls))
         cost: Cost = ControlCost(of_controls, about=about)
         state_weights, about_state, root = np.zeros(n), np.zeros(n), model.body_rootid[model.body(self.body).id]
@@ -621,3 +618,35 @@ def _is_stable(dynamics: MjcfDynamics, state: Array, control: Array, dt: float) 
     except InputError:  # beyond all numbers
         return False
     return bool(np.isfinite(motion).all()) and float(np.abs(np.linalg.eigvals(motion)).max()) < _UNSTABLE
+
+
+class _Axes(NamedTuple):
+    """Which degrees of freedom alone move a body's origin along the axes of the world (0 to 2)."""
+
+    of: dict[int, int]  # degree of freedom -> axis, where its position is the origin's coordinate
+    shifted: dict[int, tuple[int, float]]  # otherwise -> its axis, and the origin's coordinate at its zero
+    moving: tuple[bool, ...]  # whether anything moves the origin along each axis
+
+
+def _axes_of(mjcf: MjcfModel, body: int) -> _Axes:
+    """How joints move a body's origin, found by moving them: it must hold for any positions of the other joints."""
+    model, data, rng = mjcf.model, mujoco.MjData(mjcf.model), np.random.default_rng(0)
+    candidates = {
+        joint.dof + i: joint.qpos.start + i for joint in mjcf.joints if joint.kind in ("free", "slide")
+        for i in range(3 if joint.kind == "free" else 1)
+    }  # fmt: skip
+    origins, positions = np.zeros((5, 3)), np.zeros((5, model.nq))
+    for trial in range(5):
+        data.qpos[:] = model.qpos0 + rng.normal(size=model.nq)
+        mujoco.mj_normalizeQuat(model, data.qpos)
+        mujoco.mj_kinematics(model, data)
+        origins[trial], positions[trial] = data.xpos[body], data.qpos
+    exact, shifted = dict[int, int](), dict[int, tuple[int, float]]()
+    for dof, number in candidates.items():
+        for axis in range(3):
+            offset = origins[:, axis] - positions[:, number]
+            if np.abs(offset).max() < 1e-9:
+                exact[dof] = axis
+            elif np.ptp(offset) < 1e-9:
+                shifted[dof] = (axis, float(offset.mean()))
+    return _Axes(exact, shifted, tuple(bool(moved) for moved in np.ptp(origins, axis=0) > 1e-9))

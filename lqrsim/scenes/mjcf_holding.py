@@ -543,19 +543,3 @@ def _free_joints(
     moves = np.eye(model.nv)[:, free]
     moves[follow] = -np.linalg.lstsq(slopes[:, follow], slopes[:, free], rcond=None)[0]
     return free, moves.T
-
-
-def efforts(mjcf: MjcfModel) -> Array:
-    """The largest size of each control, (nu,): from its own limits, else from its force's; 1 without limits."""
-    joints, largest = {joint.name: joint for joint in mjcf.joints}, np.ones(len(mjcf.controls))
-    for actuator in mjcf.actuators:
-        sides = []
-        # Otherwise its control is no force.
-        if actuator.gain is not None and actuator.gain[0] and not any(actuator.bias or ()):
-            sides.append(np.abs(actuator.forces) / abs(actuator.gain[0]))
-            if actuator.joint is not None and actuator.gear:
-                sides.append(np.abs(joints[actuator.joint].forces) / abs(actuator.gain[0] * actuator.gear))
-        for k in range(actuator.controls.start, actuator.controls.stop):
-            limits = np.abs([mjcf.controls[k].low, mjcf.controls[k].high])
-            largest[k] = next((size for side in (limits, *sides) if 0 < (size := float(side.max())) < np.inf), 1.0)
-    return largest

@@ -2,16 +2,12 @@
 
 import copy
 from collections.abc import Callable, Iterable, Iterator
-from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.errors import Array
 from lqrsim.scenes.mujoco_log import mujoco, unlogged
-
-if TYPE_CHECKING:
-    from lqrsim.scenes.mjcf_model import MjcfModel
 
 _MET, _NEWTON = 1e-10, 30  # m or rad by which an equality may be off, and steps to it at most
 _MET_AS_GIVEN = 1e-6  # m or rad by which it may be off if all its joints are given, as by rounding
@@ -119,38 +115,6 @@ class Equalities:
             return None
         _, slopes = self.at(positions)
         return positions, qvel - np.linalg.lstsq(slopes, slopes @ qvel, rcond=_RANK)[0]
-
-
-class Axes(NamedTuple):
-    """Which degrees of freedom alone move a body's origin along the axes of the world (0 to 2)."""
-
-    of: dict[int, int]  # degree of freedom -> axis, where its position is the origin's coordinate
-    shifted: dict[int, tuple[int, float]]  # otherwise -> its axis, and the origin's coordinate at its zero
-    moving: tuple[bool, ...]  # whether anything moves the origin along each axis
-
-
-def position_of(mjcf: "MjcfModel", body: int) -> Axes:
-    """How joints move a body's origin, found by moving them: it must hold for any positions of the other joints."""
-    model, data, rng = mjcf.model, mujoco.MjData(mjcf.model), np.random.default_rng(0)
-    candidates = {
-        joint.dof + i: joint.qpos.start + i for joint in mjcf.joints if joint.kind in ("free", "slide")
-        for i in range(3 if joint.kind == "free" else 1)
-    }  # fmt: skip
-    origins, positions = np.zeros((5, 3)), np.zeros((5, model.nq))
-    for trial in range(5):
-        data.qpos[:] = model.qpos0 + rng.normal(size=model.nq)
-        mujoco.mj_normalizeQuat(model, data.qpos)
-        mujoco.mj_kinematics(model, data)
-        origins[trial], positions[trial] = data.xpos[body], data.qpos
-    exact, shifted = dict[int, int](), dict[int, tuple[int, float]]()
-    for dof, number in candidates.items():
-        for axis in range(3):
-            offset = origins[:, axis] - positions[:, number]
-            if np.abs(offset).max() < 1e-9:
-                exact[dof] = axis
-            elif np.ptp(offset) < 1e-9:
-                shifted[dof] = (axis, float(offset.mean()))
-    return Axes(exact, shifted, tuple(bool(moved) for moved in np.ptp(origins, axis=0) > 1e-9))
 
 
 def in_axes_of_bodies(model: mujoco.MjModel, geoms: npt.NDArray[np.int64], vectors: Array) -> Array:

@@ -30,7 +30,7 @@ from lqrsim.errors import Array, InputError, check_count, check_items, check_nam
 from lqrsim.scenes.mjcf_kinematics import carriers, colliding, driven_trees, placed, posed
 from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.mujoco_log import mujoco
-from lqrsim.scenes.urdf import Base, Servos, is_urdf, read_urdf
+from lqrsim.scenes.urdf import Base, Servos, is_urdf
 from lqrsim.scenes.world import FLAT, KINDS, OTHER_KINDS, Obstacle, World
 
 _FLAGS = mujoco.mjtDisableBit
@@ -120,7 +120,7 @@ def load_scene(
     """
     of_urdf: dict[str, Any] = {"base": base, "servos": servos, "efforts": efforts, "armature": armature}
     given = {name: value for name, value in of_urdf.items() if value is not None}
-    mjcf = MjcfModel(*read_urdf(name_or_path, **given)) if given else MjcfModel.of_file(name_or_path)
+    mjcf = MjcfModel.of_file(name_or_path, **given)
     # What moves in a URDF is an MjcfRobot, which has MuJoCo's distances.
     return _with_choice(mjcf, obstacles, (*KINDS, *OTHER_KINDS) if is_urdf(name_or_path) else KINDS)
 

@@ -16,9 +16,18 @@ from xml.parsers import expat
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.errors import Array, InputError, check_items, check_kind, check_name, check_number, check_path, excerpt
+from lqrsim.errors import (
+    Array,
+    InputError,
+    check_items,
+    check_kind,
+    check_name,
+    check_number,
+    check_path,
+    excerpt,
+    listed,
+)
 from lqrsim.scenes.mjcf_kinematics import axes_of, contacts_of, quaternion_of
-from lqrsim.scenes.mjcf_text import DEEPEST, SPEED_LIMIT, listed
 from lqrsim.scenes.mujoco_log import mujoco, unlogged
 
 Base = Literal["fixed", "free"]
@@ -26,6 +35,8 @@ Servo = Sequence[float]  # stiffness and damping
 Servos = Servo | Mapping[str, Servo]
 
 SUFFIX = ".urdf"
+DEEPEST = 490  # largest depth of elements; MuJoCo's reader refuses slightly more
+SPEED_LIMIT = "_velocity_limit"  # <numeric name="JOINT_velocity_limit"> is the joint's largest speed in rad/s or m/s
 _COUPLED = {"revolute", "continuous", "prismatic"}  # types of joints with one coordinate
 _SIZES = {"box": 3, "cylinder": 2, "capsule": 2, "sphere": 1, "mesh": 0}  # how many numbers the size of a geom has
 _MESHES = (".stl", ".obj", ".msh")  # files that MuJoCo reads

@@ -13,7 +13,7 @@ from lqrsim.annotations import Index, checked
 from lqrsim.errors import Array, InputError, check_items
 from lqrsim.results.rollout import BallRecord, Rollout
 from lqrsim.scenes.mjcf_kinematics import axes_of, colliding, in_axes_of_bodies
-from lqrsim.scenes.mjcf_text import model_from_xml
+from lqrsim.scenes.mjcf_model import model_from_xml
 
 ARMS = 2.0  # radius relative to the reach of the robot's own body, above which the robot has arms
 POINT = 0.02  # radius of a robot without a size, relative to the extent of the scene
