@@ -110,6 +110,25 @@ def test_a_nominal_limit_leaves_the_other_as_it_is(
     assert 0.99 * most < distance < most
 
 
+@settings(max_examples=examples(4))
+@given(least=st.floats(-30.0, 30.0), negative=st.booleans(), force=st.floats(1.0, 50.0))
+@example(least=0.0, negative=False, force=2.0)
+@example(least=0.0, negative=True, force=2.0)
+def test_a_force_with_one_limit_keeps_from_that_one(
+    tmp_path_factory: pytest.TempPathFactory, least: float, negative: bool, force: float
+) -> None:
+    """By a thousandth of twice the limit; of a limit of 0, which tells no size, by a thousandth of 1 N m."""
+    sides = f"-inf {-least}" if negative else f"{least} inf"
+    arm = robot(tmp_path_factory.mktemp("one"), f'<motor name="m" joint="a" forcerange="{sides}"/>')
+    term, away = arm.force_limits.bind(arm.dynamics), -1.0 if negative else 1.0
+    z = np.append(np.zeros(len(arm.dynamics.state_coordinates)), away * (least + force))
+    rows = [PlainTerm(term, len(z) - 1, 1).value(z, row) for row in (0, 1)]
+    spared = 1e-3 * (2 * abs(least) if least else 1.0)
+    assert rows[negative] == pytest.approx(force - spared, rel=1e-9)
+    assert rows[not negative] == np.inf
+    assert arm.force_limits._rough == pytest.approx(spared / 2)
+
+
 # Limits that leave little: along the outline, no plan keeps them.
 @example(servo=(4000.0, "implicitfast"), most=8.0, other=2.5, goal=(0.49, 0.74))
 @settings(max_examples=examples(4))

@@ -1,7 +1,12 @@
 """Distances of robots from MJCFs: those of MuJoCo's bindings, with their derivatives; and what is an obstacle."""
 
+import copy
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -17,6 +22,8 @@ from tracking import track
 import lqrsim as ls
 from lqrsim.cli import main
 from lqrsim.errors import Array, InputError
+from lqrsim.kernels import mjcf_dynamics as kernel
+from lqrsim.problem import mjcf_dynamics
 from lqrsim.problem.collision_shape import levers
 from lqrsim.problem.derivative_check import evaluate
 from lqrsim.scenes.mjcf_kinematics import reach_of
@@ -363,6 +370,9 @@ def test_a_site_is_where_and_turned_as_mujoco_has_it(seed: int) -> None:
     value, gradient, _ = evaluate(cost.bind(robot.dynamics), state, np.zeros(1))
     expected = 0.5 * np.array([1, 2, 3]) @ (own - wanted) ** 2 + 2.0 * turn @ turn
     np.testing.assert_allclose(value, expected, rtol=1e-9)
+    times = evaluate(cost.scaled(2.5).bind(robot.dynamics), state, np.zeros(1))
+    np.testing.assert_allclose(times[0], 2.5 * expected, rtol=1e-9)
+    np.testing.assert_allclose(times[1], 2.5 * gradient, rtol=1e-12, atol=1e-12)
     if np.linalg.norm(turn) > 3.0:
         return  # half a turn off there are two ways back
     term, h = cost.bind(robot.dynamics), 1e-6
@@ -715,3 +725,28 @@ def test_a_goal_inside_an_obstacle_is_found_where_positions_have_weights(seed: i
     problem = robot.problem(robot.at(x=-3.0), goal, steps=5, weights=weights)
     inside = by_bindings(robot, goal).min() < 0 and unweighed != "a position"
     assert bool(problem.goal_inside) == inside, problem.goal_inside
+
+
+@settings(max_examples=examples(3))
+@given(threads=st.integers(2, 6), seed=st.integers(0, 6))
+def test_threads_that_ask_at_once_have_one_model_of_distances(threads: int, seed: int) -> None:
+    """Whose address is that of a model that is kept: each thread is made to wait while it makes one."""
+    physics, made = arm("capsule", "sphere", seed).dynamics.physics, list[Any]()
+    _ = physics.numbers
+
+    def slow(thing: Any) -> Any:
+        made.append(copy.copy(thing))
+        time.sleep(0.05)
+        return made[-1]
+
+    begin = threading.Barrier(threads)
+
+    def ask(_: int) -> int:
+        begin.wait()
+        return physics.address()
+
+    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(threads) as pool:
+        patch.setattr(mjcf_dynamics, "copy", SimpleNamespace(copy=slow))
+        addresses = list(pool.map(ask, range(threads)))
+    assert len(set(addresses)) == len(made) == 1
+    assert physics.numbers[kernel.DISTANCE_MODEL] == made[0]._address

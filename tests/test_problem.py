@@ -14,7 +14,9 @@ from sampling import examples
 import lqrsim as ls
 from lqrsim.errors import check_symmetric
 from lqrsim.problem.control_rate import with_last_command
+from lqrsim.problem.derivative_check import evaluate
 from lqrsim.problem.parts import CostSum
+from lqrsim.problem.state_bounds import LimitCost
 from lqrsim.solvers import compiled
 
 
@@ -50,6 +52,62 @@ def test_a_sum_is_scaled_ahead_and_by_knot_as_its_terms() -> None:
     for what in ("kept_clear", "state_reference", "control_reference", "contact_curvature"):
         with pytest.raises(ls.InputError, match=r"^cost: got a sum of costs, want a single term"):
             getattr(summed, what)
+
+
+def _bump(x: Any, u: Any, p: Any) -> Any:
+    return p.height * (x[0] - 0.3) ** 2 * (1 + u[0] ** 2) + x[1] ** 4
+
+
+class Own(ls.Cost):
+    """x, squared."""
+
+    def bind(self, dynamics: ls.Dynamics) -> ls.types.CostTerm:
+        value = "def value(x, u, t, data):\n    return data[0] * x[0] * x[0]\n\n\n"
+        first = "def derivatives(x, u, t, data, hessian, gradient):\n    gradient[0] += 2 * data[0] * x[0]\n"
+        then = "    hessian[0, 0] += 2 * data[0]\n    return data[0] * x[0] * x[0]\n"
+        return ls.types.CostTerm(value + first + then, np.array([3.0]))
+
+
+KINDS = {
+    "symbolic": ls.SymbolicCost(_bump, parameters={"height": 0.7}),
+    "function": ls.FunctionCost(_bump, parameters={"height": 0.7}),
+    "limit": LimitCost({"x": 0.5}, {"y": 0.2}, weight=3.0),
+    "own": Own(),
+    "quadratic": ls.QuadraticCost([1.0, 2.0], about=[0.1, 0.2]),
+    "control": ls.ControlCost([3.0], about=[0.5]),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=examples(3))
+@given(first=st.floats(0.0, 9.0), then=st.floats(0.1, 9.0), seed=st.integers(0, 2**32 - 1))
+def test_any_cost_times_a_number_is_that_many_times_the_cost(kind: str, first: float, then: float, seed: int) -> None:
+    cost, dynamics, rng = KINDS[kind], _two(), np.random.default_rng(seed)
+    times = sum([cost.scaled(first).scaled(then)])
+    x, u = rng.normal(size=2), rng.normal(size=1)
+    for once, other in zip(evaluate(cost.bind(dynamics), x, u), evaluate(times.bind(dynamics), x, u), strict=True):
+        np.testing.assert_allclose(other, first * then * np.asarray(once), rtol=1e-12, atol=1e-12)
+    assert (times.name, times.by_knot, times.moving) == (cost.name, cost.by_knot, cost.moving)
+    with pytest.raises(ls.InputError, match=r"^factor: got -1.0, want a finite number >= 0"):
+        cost.scaled(-1.0)
+
+
+@pytest.mark.parametrize("kinds", [("limit", "own"), ("function", "symbolic", "quadratic")])
+@settings(max_examples=examples(2))
+@given(factor=st.floats(0.5, 4.0))
+def test_the_plan_of_all_costs_times_a_number_is_the_same(kinds: tuple[str, ...], factor: float) -> None:
+    """To the accuracy to which both are solved, relative to costs of 1."""
+    stage = sum((KINDS[kind] for kind in kinds), ls.ControlCost([1.0]))
+    once = ls.Problem(
+        dynamics=_two(), dt=0.1, steps=10, initial=ls.FixedState(x=1.0, y=-0.5), stage_cost=stage, final_cost=Own(),
+    )  # fmt: skip
+    times = dataclasses.replace(once, stage_cost=stage.scaled(factor), final_cost=Own().scaled(factor))
+    solutions = [ls.smooth(one) for one in (once, times)]
+    assert solutions[1].cost == pytest.approx(factor * solutions[0].cost, rel=1e-8)
+    plans = [solution.trajectory.states for solution in solutions]
+    np.testing.assert_allclose(*plans, rtol=0, atol=1e-5)
+    assert times.digest != once.digest
+    assert "Own()" in str(times)
 
 
 @settings(max_examples=examples(3))

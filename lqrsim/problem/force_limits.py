@@ -23,7 +23,7 @@ from lqrsim.scenes.mjcf_model import MjcfModel
 from lqrsim.scenes.mujoco_log import mujoco, unlogged
 
 # Fraction of its range that a plan keeps a force from its limits: MuJoCo's implicit integrators step differently where
-# a force is clipped, by however little. If one limit is nominal, such as -1e6 N, the range is twice the other.
+# a force is clipped, by however little.
 SPARED = 1e-3
 _PROBES, _LINEAR = 4, 1e-9  # random states at which a force is compared with its slopes, and the relative error
 
@@ -44,6 +44,16 @@ class ForceLimit(NamedTuple):
     slopes: Array
     of_joint: bool
     id: int
+
+    @property
+    def range(self) -> float:
+        """Its range; if one limit is nominal, such as -1e6 N, twice the other; infinite for a side of 0 alone."""
+        return min([self.high - self.low, *(2 * abs(side) for side in (self.low, self.high) if side)])
+
+    @property
+    def spared(self) -> float:
+        """How far a plan keeps it from its limits."""
+        return SPARED * (self.range if np.isfinite(self.range) else 1.0)  # nothing tells how large such a force is
 
     def can_be_kept(self, state: Array, low: Array, high: Array) -> bool:
         """Whether some control (m,) between `low` and `high` keeps it in a state (n,)."""
@@ -73,7 +83,7 @@ class ForceLimits(Constraint):
         self.limits, self.later = tuple(limits), later
         self._slopes = np.stack([limit.slopes for limit in self.limits])
         # Less than what is spared, so that forces of such a plan are within their limits.
-        self._rough = 0.5 * SPARED * min(limit.high - limit.low for limit in self.limits)
+        self._rough = 0.5 * min(limit.spared for limit in self.limits)
 
     def removed_from(self, dynamics: MjcfDynamics) -> MjcfDynamics:
         """Dynamics without these limits."""
@@ -125,14 +135,13 @@ class ForceLimits(Constraint):
             described += [f"the force {limit.name} of {word} {getattr(limit, side):g} {limit.unit}" for limit in limits]
         names = tuple(f"{limit.name} {side}" for side in ("low", "high") for limit in limits)
         low, high = (table.copy(), -table)
-        sides = np.array([(limit.low, limit.high) for limit in limits])
-        ranges = np.minimum(np.ptp(sides, axis=1), 2 * np.abs(np.where(sides == 0, np.inf, sides)).min(axis=1))
-        low[..., 0] -= sides[:, 0] + SPARED * ranges
-        high[..., 0] += sides[:, 1] - SPARED * ranges
+        low[..., 0] -= [limit.low + limit.spared for limit in limits]
+        high[..., 0] += [limit.high - limit.spared for limit in limits]
         rows = np.concatenate([low, high], axis=1)
         return ConstraintTerm(
             source_of(__name__), np.concatenate([rows.shape[:2], rows.ravel()]), rows.shape[1], described.__getitem__,
-            uses_control=True, convex=True, ranges=np.tile(ranges, 2), linear=True, yields=True, names=names,
+            uses_control=True, convex=True, linear=True, yields=True, names=names,
+            ranges=np.array([limit.range for limit in limits] * 2),
         )  # fmt: skip
 
 

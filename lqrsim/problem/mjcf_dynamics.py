@@ -98,6 +98,7 @@ class MjcfPhysics:
         self.team[kernel.TICKET] = n + m  # a job without columns left
         self._job = np.zeros(1 + (n + m) + n + 6 + n * (n + m))
         self._numbers: Array | None = None
+        self._for_distances: mujoco.MjModel | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         return MjcfPhysics, tuple(getattr(self, field.name) for field in fields(self))
@@ -152,21 +153,21 @@ class MjcfPhysics:
         return np.concatenate([numbers, joints.ravel(), *loads])
 
     def address(self) -> int:
-        """The address of the numbers, for kernels of distances. Their model, which may be large, is not made before."""
-        self.numbers[kernel.DISTANCE_MODEL] = self._for_distances._address
-        return self.numbers.ctypes.data
+        """The address of the numbers, for kernels of distances. Their model, which may be large, is not made before.
 
-    @cached_property
-    def _for_distances(self) -> mujoco.MjModel:
-        """The model with more exact distances, whose directions are gradients.
-
-        With MuJoCo's tolerance of 1e-6 m, directions between geoms that nearly touch can be a few degrees off.
+        Its distances are more exact, so that their directions are gradients: with MuJoCo's tolerance of 1e-6 m,
+        directions between geoms that nearly touch can be a few degrees off.
         """
-        exact = copy.copy(self.model)
-        exact.opt.ccd_tolerance, exact.opt.ccd_iterations = _TOLERANCE, max(_ITERATIONS, exact.opt.ccd_iterations)
-        # The other algorithm is wrong at a distance.
-        exact.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
-        return exact
+        numbers = self.numbers
+        with _making:
+            if self._for_distances is None:
+                self._for_distances = exact = copy.copy(self.model)
+                option = exact.opt
+                option.ccd_tolerance, option.ccd_iterations = _TOLERANCE, max(_ITERATIONS, option.ccd_iterations)
+                # The other algorithm is wrong at a distance.
+                option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
+                numbers[kernel.DISTANCE_MODEL] = exact._address
+        return numbers.ctypes.data
 
 
 def _soften(model: mujoco.MjModel, width: float) -> None:

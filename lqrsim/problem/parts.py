@@ -11,16 +11,16 @@ import abc
 import functools
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Generic, NoReturn, Self, TypeVar
 
 import numpy as np
 
-from lqrsim.annotations import Index, Want, checked
+from lqrsim.annotations import Index, NonNegative, Want, checked
 from lqrsim.codegen.sources import Source, source_of
 from lqrsim.codegen.user_functions import Term
 from lqrsim.errors import Array, InputError, brief, check_count, check_kind
-from lqrsim.kernels.declarations import N, loss, shared_jacobian, shared_values, stack
+from lqrsim.kernels.declarations import N, W, loss, shared_jacobian, shared_values, stack, zeros
 from lqrsim.kernels.linear_algebra import clear
 from lqrsim.problem.dynamics import Dynamics
 from lqrsim.results.solution_parts import Horizon, Trajectory, left_after
@@ -110,6 +110,13 @@ class CostTerm(Term):
             nonconvex_in=nonconvex_in or None, factor=None if factor is None else len(residual.data) + factor,
             functions=residual.functions, exact_hessian=False,
         )  # fmt: skip
+
+    def scaled(self, factor: float) -> Self:
+        """The term times a number, which is the last in its data: another number compiles nothing."""
+        kernels = source_of(__name__, FACTOR=self.numbers)
+        kernels = kernels.filled(stated=(self.code, "value"), stated_derivatives=(self.code, "derivatives"))
+        source = kernels.filled(value=(kernels, "scaled_value"), derivatives=(kernels, "scaled_derivatives"))
+        return replace(self, source=source, data=np.append(self.data, factor))
 
 
 @checked
@@ -292,9 +299,10 @@ class Cost(ProblemPart[CostTerm]):
         """Its second derivative in the distance to an obstacle at contact, in 1/m^2, which weighs paths; or 0."""
         return 0.0
 
-    def scaled(self, factor: float) -> "Cost":
-        """The cost times a number. Costs with a reference or obstacles have it: the search changes their weights."""
-        raise InputError(f"{self.name}: got no method scaled, want it to return the cost times a number")
+    @checked
+    def scaled(self, factor: NonNegative) -> "Cost":
+        """The cost times a number: a kind with a weight may override it, for the cost with another weight."""
+        return _ScaledCost(self, factor)
 
     def moved_to(self, state: Array, dynamics: Dynamics) -> "Cost":
         """The cost about another state (n,). Costs with a state reference have it: a viewer moves goals."""
@@ -312,11 +320,45 @@ class Cost(ProblemPart[CostTerm]):
         return self if type(other) is int and other == 0 else NotImplemented
 
 
-class CostSum(Cost):
+class _OfCosts(Cost):
+    """A cost that is made of others, its `terms`, which are asked what it is."""
+
+    terms: tuple[Cost, ...]
+
+    @abc.abstractmethod
+    def _of(self, terms: Iterable[Cost]) -> Self:
+        """The same of other terms."""
+
+    @property
+    def by_knot(self) -> bool:
+        return any(term.by_knot for term in self.terms)
+
+    @property
+    def moving(self) -> bool:
+        return any(term.moving for term in self.terms)
+
+    def ahead(self, steps: int, *, horizon: str = "shrinking") -> Self:
+        return self._of(term.ahead(steps, horizon=horizon) for term in self.terms)
+
+    def _at_other_knots(self, select: Callable[[Array], Array]) -> Self:
+        return self._of(term._at_other_knots(select) if term.by_knot else term for term in self.terms)
+
+    def with_added_state(self, dynamics: Dynamics) -> Self:
+        return self._of(term.with_added_state(dynamics) for term in self.terms)
+
+    def _in(self, dynamics: Dynamics) -> Self:
+        ordered = [term._in(dynamics) for term in self.terms]
+        return self if all(map(operator.is_, self.terms, ordered)) else self._of(ordered)
+
+
+class CostSum(_OfCosts):
     """The result of `+`: the terms, in order. It is bound term by term, and what differs by term is asked of each."""
 
     def __init__(self, terms: Iterable[Cost]) -> None:
         self.terms = tuple(terms)
+
+    def _of(self, terms: Iterable[Cost]) -> "CostSum":
+        return CostSum(terms)
 
     def _refused(self) -> NoReturn:
         raise InputError("cost: got a sum of costs, want a single term: bind the `terms` one by one")
@@ -327,29 +369,60 @@ class CostSum(Cost):
     def bind(self, dynamics: Dynamics) -> CostTerm:
         self._refused()
 
-    @property
-    def by_knot(self) -> bool:
-        return any(term.by_knot for term in self.terms)
-
-    @property
-    def moving(self) -> bool:
-        return any(term.moving for term in self.terms)
-
-    def ahead(self, steps: int, *, horizon: str = "shrinking") -> "CostSum":
-        return CostSum(term.ahead(steps, horizon=horizon) for term in self.terms)
-
-    def with_added_state(self, dynamics: Dynamics) -> "CostSum":
-        return CostSum(term.with_added_state(dynamics) for term in self.terms)
-
     def scaled(self, factor: float) -> "CostSum":
         return CostSum(term.scaled(factor) for term in self.terms)
 
-    def _in(self, dynamics: Dynamics) -> "CostSum":
-        ordered = [term._in(dynamics) for term in self.terms]
-        return self if all(map(operator.is_, self.terms, ordered)) else CostSum(ordered)
-
     def __repr__(self) -> str:
         return " + ".join(map(repr, self.terms))
+
+
+class _ScaledCost(_OfCosts):
+    """A cost times a number, for kinds that have no weight to change."""
+
+    def __init__(self, cost: Cost, factor: float) -> None:
+        self.terms, self.factor, self._must_be_clear = (cost,), factor, cost._must_be_clear
+
+    def _of(self, terms: Iterable[Cost]) -> "_ScaledCost":
+        return _ScaledCost(*terms, self.factor)
+
+    @property
+    def _cost(self) -> Cost:
+        return self.terms[0]
+
+    @property
+    def name(self) -> str:
+        return self._cost.name
+
+    @property
+    def state_reference(self) -> "QuadraticCost | None":
+        return None if (reference := self._cost.state_reference) is None else reference.scaled(self.factor)
+
+    @property
+    def control_reference(self) -> "ControlCost | None":
+        return None if (reference := self._cost.control_reference) is None else reference.scaled(self.factor)
+
+    @property
+    def kept_clear(self) -> "KeepsClear | None":
+        return self._cost.kept_clear
+
+    @property
+    def contact_curvature(self) -> float:
+        return self.factor * self._cost.contact_curvature
+
+    def off_place(self, dynamics: Dynamics, states: Array) -> dict[str, Array]:
+        return self._cost.off_place(dynamics, states)
+
+    def moved_to(self, state: Array, dynamics: Dynamics) -> Cost:
+        return self._of([self._cost.moved_to(state, dynamics)])
+
+    def bind(self, dynamics: Dynamics) -> CostTerm:
+        return self._cost.bind(dynamics).scaled(self.factor)
+
+    def _bind_at(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> CostTerm:
+        return self._cost._bind_at(dynamics, times, goals).scaled(self.factor)
+
+    def __repr__(self) -> str:
+        return f"{self.factor:g} * {self._cost!r}"
 
 
 def terms_of(cost: Cost) -> tuple[Cost, ...]:
@@ -507,3 +580,31 @@ def row_slope(residual, jacobian, t, row, data, gradient):
     """Add its gradient, given the whole residual and its derivatives in the states."""
     for i in range(N):
         gradient[i] += jacobian[row, i]
+
+
+# The kernels of a cost times a number, which `data` has at FACTOR.
+FACTOR = 0
+
+
+def scaled_value(x, u, t, data):
+    """The cost."""
+    return data[FACTOR] * stated(x, u, t, data)
+
+
+def scaled_derivatives(x, u, t, data, hessian, gradient):
+    """Add the Hessian (W, W) and the gradient (W,), and return the cost."""
+    curve, slope = zeros(W, W), zeros(W)
+    total = stated_derivatives(x, u, t, data, curve, slope)
+    for i in range(W):
+        gradient[i] += data[FACTOR] * slope[i]
+        for j in range(W):
+            hessian[i, j] += data[FACTOR] * curve[i, j]
+    return data[FACTOR] * total
+
+
+def stated(x, u, t, data):
+    """The cost without the number; filled in."""
+
+
+def stated_derivatives(x, u, t, data, hessian, gradient):
+    """Its derivatives; filled in."""
