@@ -994,7 +994,9 @@ class TestParts:
             gradient[0], gradient[1], gradient[3] = 2 * p.a * x[0], u[0], x[1]
             hessian[0, 0], hessian[1, 3], hessian[3, 1] = 2 * p.a, 1.0, 1.0
 
-        of_term(ls.FunctionCost(cost, derivatives=slopes if given else None, parameters={"a": 0.7}).bind(CART))
+        stated = ls.FunctionCost(cost, derivatives=slopes if given else None, parameters={"a": 0.7})
+        of_term(stated.bind(CART))
+        of_term(stated.scaled(2.5).bind(CART))
 
     @pytest.mark.parametrize("level", BALLS)
     def test_balls(self, level: str) -> None:

@@ -18,7 +18,7 @@ from lqrsim.codegen.sources import Source, source_of
 from lqrsim.errors import Array, InputError, brief, check_array, check_items, free_name, keep, numbers_of
 from lqrsim.kernels.declarations import M, N, W, at, call, stack, zeros
 from lqrsim.problem.dynamics import Dynamics
-from lqrsim.problem.parts import Constraint, ConstraintTerm, Cost, CostTerm, ProblemPart, bind_all, terms_of
+from lqrsim.problem.parts import Constraint, ConstraintTerm, Cost, CostTerm, ProblemPart
 from lqrsim.problem.quadratic_cost import QuadraticCost
 from lqrsim.results.coordinates import Coordinates, PerEntry
 
@@ -262,16 +262,14 @@ def with_last_command(problem: "Problem") -> "Problem":
 
     if not isinstance(problem.initial, Cost):
         initial = problem.initial._extended(np.zeros(m))
-        begun: Cost = initial._cost
     else:
         # A weight, which costs nothing: a cost-to-come needs one of each state.
         weight = np.diag(np.pad(np.ones(m), (len(dynamics.state_coordinates), 0)))
-        begun = added(problem.initial)
-        if isinstance(begun, QuadraticCost):  # else the problem's start would be no longer known
-            begun = QuadraticCost(begun.weight + weight, about=begun.about)
+        initial = added(problem.initial)
+        if isinstance(initial, QuadraticCost):  # else the problem's start would be no longer known
+            initial = QuadraticCost(initial.weight + weight, about=initial.about)
         else:
-            begun += QuadraticCost(weight, about=np.zeros(len(weight)))
-        initial = begun
+            initial += QuadraticCost(weight, about=np.zeros(len(weight)))
     stage, constraints = added(problem.stage_cost), list(map(added, problem.constraints))
     if rate.weight is not None:
         stage += RateCost(rate, problem.dt)
@@ -279,11 +277,8 @@ def with_last_command(problem: "Problem") -> "Problem":
         constraints.append(RateLimits(rate, problem.dt))
     final = added(problem.final_cost)
     # Without new checks, as the rest of a problem may begin where a new problem may not.
-    other = problem._with(dynamics=wide, initial=initial, stage_cost=stage, final_cost=final, control_rate=None)
-    parts = {"initial": begun, "stage_cost": stage, "final_cost": final}
-    terms = {name: other._bound(terms_of(cost)) for name, cost in parts.items()}
-    bound = bind_all(constraints, wide, problem.times)
-    return other._with(_terms=terms, constraints=tuple(constraints), constraint_terms=bound)
+    other = problem._with(dynamics=wide, control_rate=None)
+    return other._with(**other._bound(constraints, initial=initial, stage_cost=stage, final_cost=final))
 
 
 # The kernels of cost and limits. `data` has 1 if the command before the first step is known, else 0; dt in s; and that

@@ -79,6 +79,8 @@ class ForceLimits(Constraint):
         at zero, and its slopes in state and control; None for the beginning of a period alone.
     """
 
+    _same_with_added_state = True
+
     def __init__(self, limits: Sequence[ForceLimit], later: Array | None = None) -> None:
         self.limits, self.later = tuple(limits), later
         self._slopes = np.stack([limit.slopes for limit in self.limits])
@@ -106,9 +108,6 @@ class ForceLimits(Constraint):
             at_zero = self._slopes[:, :1] + (by_state @ (state - a @ x - b @ u))[:, None]
             forces.append(np.hstack([at_zero, by_state @ a, by_state @ b + by_control]))
         return np.concatenate(forces)
-
-    def with_added_state(self, dynamics: Dynamics) -> "ForceLimits":
-        return self
 
     def _refined(self, dynamics: Dynamics, plan: Trajectory) -> "ForceLimits | None":
         mjcf_dynamics = dynamics.calling

@@ -44,6 +44,8 @@ class KeepsClear:
       balls, geoms: None if not given.
     """
 
+    _same_with_added_state = True
+
     def _set_shape(
         self, world: World, radius: float | None, balls: CollisionSpheres | None, geoms: CollisionGeoms | None
     ) -> None:
@@ -59,9 +61,6 @@ class KeepsClear:
 
     @property
     def kept_clear(self) -> "KeepsClear":
-        return self
-
-    def with_added_state(self, dynamics: Dynamics) -> Self:
         return self
 
     @property
@@ -269,6 +268,8 @@ class SelfClearance(Constraint):
     The links are those of `link_pairs` of `scenes/scene.py`; `links` has their pairs, by the names of their bodies.
     """
 
+    _same_with_added_state = True
+
     @checked
     def __init__(self, mjcf: MjcfModel, body: str, margin: Finite = 0.0) -> None:
         model = mjcf.model
@@ -279,9 +280,6 @@ class SelfClearance(Constraint):
         keys, rows = np.unique(bodies, axis=0, return_inverse=True)
         self._rows = np.asarray(rows, dtype=np.int64).ravel()
         self.links = tuple((model.body(first).name, model.body(second).name) for first, second in keys.tolist())
-
-    def with_added_state(self, dynamics: Dynamics) -> Self:
-        return self
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         if not isinstance(dynamics.calling, MjcfDynamics):

@@ -12,7 +12,8 @@ import functools
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Generic, NoReturn, Self, TypeVar
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Any, Generic, NoReturn, Self, TypeVar
 
 import numpy as np
 
@@ -203,6 +204,8 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
     A kind writes `bind`. The rest are answers that most kinds share; a kind with another answer overrides it.
     """
 
+    _same_with_added_state = False
+
     @abc.abstractmethod
     def bind(self, dynamics: Dynamics) -> _BoundTerm:
         """Bind the term to a system."""
@@ -219,6 +222,8 @@ class ProblemPart(abc.ABC, Generic[_BoundTerm]):
         """The same for a system with one more state, the last, of which it is independent: for a free duration, and for
         each control with a `control_rate`. `dynamics` are those without that state.
         """
+        if self._same_with_added_state:
+            return self
         got = f"a {type(self).__name__} beside one of them, which cannot have one more state"
         raise InputError(f"duration and control_rate: got {got}, want none")
 
@@ -432,15 +437,6 @@ def terms_of(cost: Cost) -> tuple[Cost, ...]:
     return (check_kind("cost", cost, Cost, Cost._want),)
 
 
-def in_system(cost: Cost, dynamics: Dynamics, field: str) -> Cost:
-    """The cost with numbers by name in the order of a system; the same object if it has no numbers by name."""
-    ordered = check_kind(field, cost, Cost, Cost._want)._in(dynamics)
-    for term in terms_of(ordered):
-        if field in ("initial", "final_cost") and term.by_knot:
-            raise InputError(f"{field}: got a {term.name} with a row for each knot, want one row, such as rows[-1]")
-    return ordered
-
-
 def weighing_obstacles(cost: Cost, factor: float) -> CostSum:
     """The cost with the weights of its obstacles multiplied."""
     return CostSum(term if term.kept_clear is None else term.scaled(factor) for term in terms_of(cost))
@@ -482,12 +478,17 @@ def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int,
 
 def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array) -> tuple[ConstraintTerm, ...]:
     """The constraints for a system and the times (T+1,) in s of the knots."""
-    goals, terms = goals_of(constraints, dynamics), []
     _check_bounds([constraint.state_bounds(dynamics) for constraint in constraints], dynamics, len(times))
-    for constraint in constraints:
-        term = constraint._bind_at(dynamics, times, goals)
-        terms.append(check_kind(f"{type(constraint).__name__}.bind", term, ConstraintTerm, "a ConstraintTerm"))
-    return tuple(terms)
+    return terms_for(dynamics, times, constraints, ConstraintTerm, goals_of(constraints, dynamics))
+
+
+def terms_for(
+    dynamics: Dynamics, times: Array, parts: Iterable[ProblemPart[Any]], kind: type[_BoundTerm],
+    goals: Mapping[int, float] = MappingProxyType({}),
+) -> tuple[_BoundTerm, ...]:  # fmt: skip
+    """The terms of costs or constraints; see `ProblemPart._bind_at`. Raises InputError if `bind` returns no such."""
+    pairs = [(f"{type(part).__name__}.bind", part._bind_at(dynamics, times, goals)) for part in parts]
+    return tuple(check_kind(field, term, kind, f"a {kind.__name__}") for field, term in pairs)
 
 
 def _check_bounds(all_bounds: Sequence[Mapping[int, tuple[Side, Side]]], dynamics: Dynamics, knots: int) -> None:
@@ -582,8 +583,10 @@ def row_slope(residual, jacobian, t, row, data, gradient):
         gradient[i] += jacobian[row, i]
 
 
-# The kernels of a cost times a number, which `data` has at FACTOR.
+# The kernels of a cost times a number, which `data` has at FACTOR; the cost itself is filled in.
 FACTOR = 0
+stated: Any = None
+stated_derivatives: Any = None
 
 
 def scaled_value(x, u, t, data):
@@ -600,11 +603,3 @@ def scaled_derivatives(x, u, t, data, hessian, gradient):
         for j in range(W):
             hessian[i, j] += data[FACTOR] * curve[i, j]
     return data[FACTOR] * total
-
-
-def stated(x, u, t, data):
-    """The cost without the number; filled in."""
-
-
-def stated_derivatives(x, u, t, data, hessian, gradient):
-    """Its derivatives; filled in."""

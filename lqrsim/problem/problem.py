@@ -39,8 +39,8 @@ from lqrsim.problem.parts import (
     CostTerm,
     bind_all,
     goals_of,
-    in_system,
     names_of,
+    terms_for,
     terms_of,
 )
 from lqrsim.problem.quadratic_cost import QuadraticCost, about_state, references_of
@@ -195,15 +195,9 @@ class Problem(OneVersion):
     def __post_init__(self) -> None:
         self.dynamics.check_period(self.dt)
         check_memory("steps", self.steps, self.bytes_per_step)
-        for name in ("stage_cost", "final_cost", "initial"):
-            part, fixed = getattr(self, name), name == "initial" and isinstance(self.initial, FixedState)
-            keep(self, **{name: part._in(self.dynamics) if fixed else in_system(part, self.dynamics, name)})
-        initial = self.initial._cost if isinstance(self.initial, FixedState) else self.initial
-        costs = {"stage_cost": self.stage_cost, "final_cost": self.final_cost, "initial": initial}
-        bound = {name: self._bound(terms_of(cost)) for name, cost in costs.items()}
-        constraint_terms = bind_all(self.constraints, self.dynamics, self.times)
-        noise_term = None if self.noise is None else self.noise.bind(self.dynamics)
-        keep(self, _terms=bound, constraint_terms=constraint_terms, noise_term=noise_term)
+        keep(self, _terms={}, noise_term=None if self.noise is None else self.noise.bind(self.dynamics))
+        parts = "stage_cost", "final_cost", "initial", "constraints"
+        keep(self, **self._bound(**{name: getattr(self, name) for name in parts}))
         self._checked_parts()
         if self.risk and self.noise is None:
             raise InputError(f"risk: got {self.risk:g} for a problem without noise, want noise=Noise(...), or 0")
@@ -234,10 +228,22 @@ class Problem(OneVersion):
         """Whether the problem depends on the time at which it begins, as with obstacles that move or a reference."""
         return any(part.moving or part.by_knot for part in (self.stage_cost, *self.constraints))
 
-    def _bound(self, costs: tuple[Cost, ...]) -> tuple[CostTerm, ...]:
-        """The costs for the system. Raises InputError if `bind` does not return a term."""
-        pairs = [(f"{type(cost).__name__}.bind", cost._bind_at(self.dynamics, self.times, {})) for cost in costs]
-        return tuple(check_kind(field, term, CostTerm, "a CostTerm") for field, term in pairs)
+    def _bound(self, constraints: Sequence[Constraint] | None = None, **costs: Cost | FixedState) -> dict[str, Any]:
+        """Fields with these parts, whose numbers by name are in the order of the system, and with the terms there."""
+        fields: dict[str, Any] = {"_terms": self._terms.copy()}
+        for name, stated in costs.items():
+            fields[name] = cost = check_kind(name, stated, (Cost, FixedState), Cost._want)._in(self.dynamics)
+            parts = terms_of(cost._cost if name == "initial" and isinstance(cost, FixedState) else cost)
+            for part in parts if name != "stage_cost" else ():
+                if part.by_knot:
+                    raise InputError(
+                        f"{name}: got a {part.name} with a row for each knot, want one row, such as rows[-1]"
+                    )
+            fields["_terms"][name] = terms_for(self.dynamics, self.times, parts, CostTerm)
+        if constraints is not None:
+            fields["constraints"] = tuple(constraints)
+            fields["constraint_terms"] = bind_all(constraints, self.dynamics, self.times)
+        return fields
 
     def from_state(self, state: npt.ArrayLike, *, after: int = 0, previous: npt.ArrayLike | None = None) -> "Problem":
         """The rest of the problem after some steps, from a state (n,) that is given exactly.
@@ -275,10 +281,10 @@ class Problem(OneVersion):
 
     def with_costs(self, *, stage_cost: Cost | None = None, final_cost: Cost | None = None) -> "Problem":
         """The problem with other costs, None for the present ones. It may begin inside an obstacle if this one does."""
-        given = {"stage_cost": stage_cost, "final_cost": final_cost}
-        costs = {name: in_system(cost, self.dynamics, name) for name, cost in given.items() if cost is not None}
-        terms = {name: self._bound(terms_of(cost)) for name, cost in costs.items()}
-        return self._with(**costs, _terms=self._terms | terms)._checked_parts()
+        stated = {"stage_cost": stage_cost, "final_cost": final_cost}
+        return self._with(
+            **self._bound(**{name: cost for name, cost in stated.items() if cost is not None})
+        )._checked_parts()
 
     def _refined(self, plan: Trajectory) -> "Problem | None":
         """The problem with constraints as they are to be along a plan that misses some within its periods, or None."""
@@ -290,8 +296,7 @@ class Problem(OneVersion):
     @checked
     def with_constraints(self, constraints: Constraints) -> "Problem":
         """The problem with other constraints. It may begin inside an obstacle if this one does; see `from_state`."""
-        terms = bind_all(constraints, self.dynamics, self.times)
-        return self._with(constraints=constraints, constraint_terms=terms)._checked_parts()
+        return self._with(**self._bound(constraints))._checked_parts()
 
     @checked
     def later(self, seconds: Finite) -> "Problem":
@@ -351,10 +356,12 @@ class Problem(OneVersion):
 
     def _bound_anew(self) -> "Problem":
         """The same problem, bound anew wherever it depends on the steps or on the time at which it begins."""
-        stage = zip(terms_of(self.stage_cost), self._terms["stage_cost"], strict=True)
-        terms = tuple(self._bound((cost,))[0] if cost.moving else term for cost, term in stage)
-        constraints = bind_all(self.constraints, self.dynamics, self.times)
-        return self._with(_terms=self._terms | {"stage_cost": terms}, constraint_terms=constraints)
+        costs, terms = terms_of(self.stage_cost), list(self._terms["stage_cost"])
+        for i in (i for i, cost in enumerate(costs) if cost.moving):
+            (terms[i],) = terms_for(self.dynamics, self.times, costs[i : i + 1], CostTerm)
+        fields = self._bound(self.constraints)
+        fields["_terms"]["stage_cost"] = tuple(terms)
+        return self._with(**fields)
 
     def _checked_parts(self) -> "Problem":
         """The same problem, whose costs or constraints must go with the rest."""

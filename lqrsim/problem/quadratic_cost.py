@@ -198,12 +198,10 @@ class ControlCost(_SquareCost):
     """
 
     controls = True
+    _same_with_added_state = True
 
     @property
     def control_reference(self) -> "ControlCost":
-        return self
-
-    def with_added_state(self, dynamics: Dynamics) -> Self:
         return self
 
 

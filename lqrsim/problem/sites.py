@@ -1,14 +1,14 @@
 """Costs and constraints on sites of an MJCF, such as a gripper at a desired pose: classes and kernel."""
 
 from math import atan2, sqrt
-from typing import Annotated, Self
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
 from lqrsim.annotations import OneOf, checked
 from lqrsim.codegen.sources import source_of
-from lqrsim.errors import Array, InputError, brief, check_array, check_name, check_text, check_weights
+from lqrsim.errors import Array, InputError, check_array, check_name, check_text, check_weights
 from lqrsim.kernels.declarations import N, at, call, int32, stack, store
 from lqrsim.kernels.linear_algebra import clear
 from lqrsim.kernels.mjcf_dynamics import (
@@ -37,47 +37,42 @@ from lqrsim.scenes.mujoco_log import mujoco, unlogged
 from lqrsim.scenes.world import SPACE
 
 
-class _Pose:
-    """The desired position (3,), orientation (4,), or both of a site, checked; `what` is the class for messages."""
+class _OfSite:
+    """A cost or a constraint on a site: on its position (3,), its orientation (4,), or both."""
 
-    def __init__(self, what: str, site: str, position: npt.ArrayLike | None, orientation: npt.ArrayLike | None) -> None:
-        self.what, self.site = what, check_text(f"{what}: site", site, "the name of a site", at_most=1000)
+    _same_with_added_state = True
+
+    def _set_place(self, site: str, position: npt.ArrayLike | None, orientation: npt.ArrayLike | None) -> None:
+        what = type(self).__name__
+        self.site = check_text(f"{what}: site", site, "the name of a site", at_most=1000)
         if position is None and orientation is None:
             raise InputError(f"{what}: got neither position nor orientation, want at least one")
         self.position = None if position is None else check_array(f"{what}: position", position, (3,))
-        self.axes: Array | None = None
         self.orientation: Array | None = None
         if orientation is not None:
-            quaternion = check_array(f"{what}: orientation", orientation, (4,))
-            if not np.linalg.norm(quaternion) > 1e-9:
-                raise InputError(f"{what}: orientation: got {quaternion.tolist()}, want a nonzero (w, x, y, z)")
-            self.orientation = quaternion
-            self.axes = axes_of(quaternion / np.linalg.norm(quaternion))
+            self.orientation = check_array(f"{what}: orientation", orientation, (4,))
+            if not np.linalg.norm(self.orientation) > 1e-9:
+                raise InputError(f"{what}: orientation: got {self.orientation.tolist()}, want a nonzero (w, x, y, z)")
 
-    def __repr__(self) -> str:
-        placed = f" at {brief(self.position)}" if self.position is not None else ""
-        turned = f" turned to {brief(self.orientation)}" if self.orientation is not None else ""
-        return f"{self.site!r}{placed}{turned}"
-
-    def bind(self, dynamics: Dynamics) -> Residual:
-        """The errors of the pose as functions of the state. Raises InputError if the dynamics have no such site."""
+    def _errors(self, dynamics: Dynamics) -> Residual:
+        """How far the site is off, as functions of the state. Raises InputError if the dynamics have no such site."""
         if not isinstance(mjcf_dynamics := dynamics.calling, MjcfDynamics):
-            raise InputError(f"{self.what}: got {dynamics.name}, want the dynamics of an MjcfRobot")
-        model = mjcf_dynamics.physics.model
+            raise InputError(f"{type(self).__name__}: got {dynamics.name}, want the dynamics of an MjcfRobot")
+        model, turn = mjcf_dynamics.physics.model, self.orientation
         names = [model.site(number).name for number in range(model.nsite)]
-        number = names.index(check_name(f"{self.what}: site", self.site, [name for name in names if name]))
+        field = f"{type(self).__name__}: site"
+        number = names.index(check_name(field, self.site, [name for name in names if name]))
         rows = [f"{self.site} at its {axis}" for axis in SPACE if self.position is not None]
-        rows += [f"{self.site} turned about {axis}" for axis in SPACE if self.axes is not None]
+        rows += [f"{self.site} turned about {axis}" for axis in SPACE if turn is not None]
         position = np.zeros(3) if self.position is None else self.position
-        wanted = np.eye(3) if self.axes is None else self.axes
-        source = source_of(__name__, PLACED=int(self.position is not None), TURNED=int(self.axes is not None))
+        wanted = np.eye(3) if turn is None else axes_of(turn / np.linalg.norm(turn))
+        source = source_of(__name__, PLACED=int(self.position is not None), TURNED=int(turn is not None))
         axes = axes_of(model.site_quat[number]).ravel()
         data = np.concatenate([[model.site_bodyid[number]], model.site_pos[number], axes, position, wanted.ravel()])
         return Residual(source, data, tuple(rows), model.nv, functions=(MjcfMemory.of(mjcf_dynamics),))
 
     @unlogged()
-    def off(self, dynamics: Dynamics, states: Array) -> dict[str, Array]:
-        """The distance (K,) of the site from its position in m, and its turn (K,) from the orientation in rad."""
+    def off_place(self, dynamics: Dynamics, states: Array) -> dict[str, Array]:
         mjcf_dynamics = dynamics.calling
         assert isinstance(mjcf_dynamics, MjcfDynamics)
         model, errors = mjcf_dynamics.physics.model, dict[str, Array]()
@@ -97,7 +92,7 @@ class _Pose:
         return errors
 
 
-class SiteCost(Cost):
+class SiteCost(_OfSite, Cost):
     """`1/2 weight |p - position|^2 + 1/2 turn_weight |r|^2` of a site of a robot from an MJCF.
 
     p is the position of the site, and r the rotation vector from the desired orientation to the site's.
@@ -123,26 +118,19 @@ class SiteCost(Cost):
         weight: npt.ArrayLike = 1.0,
         turn_weight: npt.ArrayLike = 1.0,
     ) -> None:
-        self.pose = _Pose("SiteCost", site, position, orientation)
+        self._set_place(site, position, orientation)
         self.weights = tuple(
             check_weights(f"SiteCost: {name}", values, 3)
             for name, values in (("weight", weight), ("turn_weight", turn_weight))
         )
 
-    def off_place(self, dynamics: Dynamics, states: Array) -> dict[str, Array]:
-        return self.pose.off(dynamics, states)
-
-    def with_added_state(self, dynamics: Dynamics) -> Self:
-        return self
-
     def bind(self, dynamics: Dynamics) -> CostTerm:
-        errors, (of_position, of_turn) = self.pose.bind(dynamics), self.weights
-        used = [of_position] if self.pose.position is not None else []
-        weights = np.concatenate([*used, *([of_turn] if self.pose.axes is not None else [])])
-        return CostTerm.of_residual(errors, source_of(__name__, AT=errors.numbers), weights)
+        errors, places = self._errors(dynamics), (self.position, self.orientation)
+        used = [weights for weights, place in zip(self.weights, places, strict=True) if place is not None]
+        return CostTerm.of_residual(errors, source_of(__name__, AT=errors.numbers), np.concatenate(used))
 
 
-class SiteConstraint(Constraint):
+class SiteConstraint(_OfSite, Constraint):
     """A site of a robot from an MJCF has exactly a desired position, or a desired orientation, or both.
 
         ls.SiteConstraint("gripper", position=(0.4, 0.2, 0.3), orientation=(0, 1, 0, 0))
@@ -162,17 +150,11 @@ class SiteConstraint(Constraint):
         orientation: npt.ArrayLike | None = None,
         at: Annotated[str, OneOf(STEPS)] = "final",
     ) -> None:
-        self.pose = _Pose("SiteConstraint", site, position, orientation)
+        self._set_place(site, position, orientation)
         self.at = at
 
-    def off_place(self, dynamics: Dynamics, states: Array) -> dict[str, Array]:
-        return self.pose.off(dynamics, states)
-
-    def with_added_state(self, dynamics: Dynamics) -> Self:
-        return self
-
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
-        errors = self.pose.bind(dynamics)
+        errors = self._errors(dynamics)
         return ConstraintTerm.of_residual(
             errors, np.zeros((1, 1)), [0] * errors.rows, errors.parts.__getitem__, equality=True,
             final_only=self.at == "final",

@@ -149,6 +149,8 @@ class StateBounds(Constraint):
 class LimitCost(Cost):
     """`1/2 weight depth^2` for each state, by name, that is past a bound by some depth: a soft limit."""
 
+    _same_with_added_state = True
+
     @checked
     def __init__(
         self, low: Mapping[str, float] | None = None, high: Mapping[str, float] | None = None, *, weight: NonNegative
@@ -156,9 +158,6 @@ class LimitCost(Cost):
         self.weight = weight
         bounds = [(1.0, *item) for item in (low or {}).items()] + [(-1.0, *item) for item in (high or {}).items()]
         self.bounds = [(name, sign, check_number(f"LimitCost: bound of {name}", bound)) for sign, name, bound in bounds]
-
-    def with_added_state(self, dynamics: Dynamics) -> Self:
-        return self
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
         names = dynamics.state_coordinates.names

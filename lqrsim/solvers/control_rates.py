@@ -76,8 +76,7 @@ def feedback(
     gain, cost_to_go = np.zeros((*controls.shape, states.shape[1])), None
     if plan.finite:
         stage = problem.stage_cost + bounding_cost(problem, controls)
-        other = problem._with(stage_cost=stage, control_rate=None)
-        other = other._with(_terms=problem._terms | {"stage_cost": other._bound(stage.terms)})
+        other = problem._with(control_rate=None, **problem._bound(stage_cost=stage))
         gain, cost_to_go = _gains(other, states, controls, multipliers[: len(problem.constraints)])
     law = compiled.law_about(states, controls, gain)
     return compiled.policy_of(problem, *law, states[:-1].copy()), cost_to_go
