@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -156,8 +156,7 @@ class MjcfRobot(Robot):
         if turns_about is not None and not rotations:
             raise InputError(f"{who}: turns_about: got {turns_about!r} without a free or ball joint, want None")
         turns = [] if turns_about is None else [first + AXES.index(turns_about) for first in rotations]
-        self._axes = _axes_of(mjcf, number)
-        dofs, plane = self._position(position, names, who)
+        dofs, plane = self._position(number, position, names, who)
         limits = {joint.dof: joint.limits for joint in mjcf.joints if joint.limits is not None}
         low, high = zip(*(limits.get(i, (-np.inf, np.inf)) for i in range(len(names))), strict=True)
         states = Coordinates(
@@ -189,20 +188,23 @@ class MjcfRobot(Robot):
         moved = World([replace(compiled, velocity=obstacle.velocity) for compiled, obstacle in pairs])
         return other.geoms.in_world(other.dynamics, moved)
 
-    def _position(self, asked: Sequence[str] | None, names: tuple[str, ...], who: str) -> tuple[tuple[int, ...], str]:
-        axes = self._axes
+    def _position(
+        self, body: int, asked: Sequence[str] | None, names: tuple[str, ...], who: str
+    ) -> tuple[tuple[int, ...], str]:
+        """The states that are the body's position, as asked or by default, and their plane; both empty for none."""
+        self._axes, moving = _axes_of(self.mjcf, body)
+        axes = {dof: axis for dof, (axis, offset) in self._axes.items() if not offset}
         if asked is None:
-            dofs = sorted(axes.of, key=lambda dof: axes.of[dof])
-            reached = {axes.of[dof] for dof in dofs}
+            dofs = sorted(axes, key=lambda dof: axes[dof])
             # A plane is a position only if nothing moves the body out of it.
-            if len(reached) < len(dofs) or len(dofs) < max(sum(axes.moving), 2):
+            if len(set(axes.values())) < len(dofs) or len(dofs) < max(moving, 2):
                 return (), ""
         else:
             listed = check_items(f"{who}: position", asked, str, "a tuple of 2 or 3 names of states, or ()")
             dofs = [names.index(check_name(f"{who}: position", name, names)) for name in listed]
-        plane = "".join(AXES[axes.of[dof]] for dof in dofs if dof in axes.of)
+        plane = "".join(AXES[axes[dof]] for dof in dofs if dof in axes)
         if dofs and (len(plane) != len(dofs) or len(set(plane)) < len(plane)):
-            got, among = excerpt(tuple(asked or ())), ", ".join(names[dof] for dof in axes.of) or "none"
+            got, among = excerpt(tuple(asked or ())), ", ".join(names[dof] for dof in axes) or "none"
             raise InputError(
                 f"{who}: position: got {got}, want 2 or 3 that are the position of the body {self.body!r},"
                 f" among: {among}" + "".join(f"; {line}" for line in self._shifted(names))
@@ -214,7 +216,8 @@ class MjcfRobot(Robot):
         return [
             f"{names[dof]} is the body's {AXES[axis]} minus {offset:.6g} m, and would be its {AXES[axis]}"
             f' with ref="{offset:.6g}" in the <joint>'
-            for dof, (axis, offset) in self._axes.shifted.items()
+            for dof, (axis, offset) in self._axes.items()
+            if offset
         ]
 
     @property
@@ -620,16 +623,11 @@ def _is_stable(dynamics: MjcfDynamics, state: Array, control: Array, dt: float) 
     return bool(np.isfinite(motion).all()) and float(np.abs(np.linalg.eigvals(motion)).max()) < _UNSTABLE
 
 
-class _Axes(NamedTuple):
-    """Which degrees of freedom alone move a body's origin along the axes of the world (0 to 2)."""
+def _axes_of(mjcf: MjcfModel, body: int) -> tuple[dict[int, tuple[int, float]], int]:
+    """The degrees of freedom that alone move a body's origin along an axis of the world, found by moving all joints.
 
-    of: dict[int, int]  # degree of freedom -> axis, where its position is the origin's coordinate
-    shifted: dict[int, tuple[int, float]]  # otherwise -> its axis, and the origin's coordinate at its zero
-    moving: tuple[bool, ...]  # whether anything moves the origin along each axis
-
-
-def _axes_of(mjcf: MjcfModel, body: int) -> _Axes:
-    """How joints move a body's origin, found by moving them: it must hold for any positions of the other joints."""
+    Each with the axis, and the origin's coordinate there at its zero; and the number of axes along which it moves.
+    """
     model, data, rng = mjcf.model, mujoco.MjData(mjcf.model), np.random.default_rng(0)
     candidates = {
         joint.dof + i: joint.qpos.start + i for joint in mjcf.joints if joint.kind in ("free", "slide")
@@ -641,12 +639,10 @@ def _axes_of(mjcf: MjcfModel, body: int) -> _Axes:
         mujoco.mj_normalizeQuat(model, data.qpos)
         mujoco.mj_kinematics(model, data)
         origins[trial], positions[trial] = data.xpos[body], data.qpos
-    exact, shifted = dict[int, int](), dict[int, tuple[int, float]]()
+    axes = dict[int, tuple[int, float]]()
     for dof, number in candidates.items():
         for axis in range(3):
             offset = origins[:, axis] - positions[:, number]
-            if np.abs(offset).max() < 1e-9:
-                exact[dof] = axis
-            elif np.ptp(offset) < 1e-9:
-                shifted[dof] = (axis, float(offset.mean()))
-    return _Axes(exact, shifted, tuple(bool(moved) for moved in np.ptp(origins, axis=0) > 1e-9))
+            if np.ptp(offset) < 1e-9:
+                axes[dof] = axis, 0.0 if np.abs(offset).max() < 1e-9 else float(offset.mean())
+    return axes, int((np.ptp(origins, axis=0) > 1e-9).sum())

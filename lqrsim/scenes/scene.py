@@ -122,24 +122,20 @@ def load_scene(
     given = {name: value for name, value in of_urdf.items() if value is not None}
     mjcf = MjcfModel.of_file(name_or_path, **given)
     # What moves in a URDF is an MjcfRobot, which has MuJoCo's distances.
-    return _with_choice(mjcf, obstacles, (*KINDS, *OTHER_KINDS) if is_urdf(name_or_path) else KINDS)
+    kinds = (*KINDS, *OTHER_KINDS) if is_urdf(name_or_path) else KINDS
+    return scene_of(mjcf, chosen_geoms(mjcf.model, obstacles, f"scene {mjcf.name}"), kinds)
 
 
 def scene_from_xml(xml: str, name: str, *, obstacles: Choice = True) -> Scene:
     """The scene of an MJCF given as text, without includes."""
-    return _with_choice(MjcfModel(name, xml), obstacles)
-
-
-def _with_choice(mjcf: MjcfModel, obstacles: Choice, kinds: Collection[str] = KINDS) -> Scene:
-    every = obstacles is True
-    geoms = obstacle_geoms(mjcf.model) if every else chosen_geoms(mjcf.model, obstacles, f"scene {mjcf.name}")
-    return scene_of(mjcf, geoms, kinds)
+    mjcf = MjcfModel(name, xml)
+    return scene_of(mjcf, chosen_geoms(mjcf.model, obstacles, f"scene {name}"), KINDS)
 
 
 def chosen_geoms(model: mujoco.MjModel, obstacles: Choice, what: str) -> list[int]:
-    """Ids of the geoms that the `obstacles=` of `load_scene` chooses, other than True."""
-    if obstacles is False:
-        return []
+    """Ids of the geoms that the `obstacles=` of `load_scene` chooses."""
+    if isinstance(obstacles, bool):
+        return obstacle_geoms(model) if obstacles else []
     fixed = np.flatnonzero(model.body_weldid[model.geom_bodyid] == 0).tolist()
     if callable(obstacles):
         try:
