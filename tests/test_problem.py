@@ -83,7 +83,7 @@ KINDS = {
 @given(first=st.floats(0.0, 9.0), then=st.floats(0.1, 9.0), seed=st.integers(0, 2**32 - 1))
 def test_any_cost_times_a_number_is_that_many_times_the_cost(kind: str, first: float, then: float, seed: int) -> None:
     cost, dynamics, rng = KINDS[kind], _two(), np.random.default_rng(seed)
-    times = sum([cost.scaled(first).scaled(then)])
+    times: Any = sum([cost.scaled(first).scaled(then)])
     x, u = rng.normal(size=2), rng.normal(size=1)
     for once, other in zip(evaluate(cost.bind(dynamics), x, u), evaluate(times.bind(dynamics), x, u), strict=True):
         np.testing.assert_allclose(other, first * then * np.asarray(once), rtol=1e-12, atol=1e-12)

@@ -388,7 +388,8 @@ class _ScaledCost(_OfCosts):
         self.terms, self.factor, self._must_be_clear = (cost,), factor, cost._must_be_clear
 
     def _of(self, terms: Iterable[Cost]) -> "_ScaledCost":
-        return _ScaledCost(*terms, self.factor)
+        (cost,) = terms
+        return _ScaledCost(cost, self.factor)
 
     @property
     def _cost(self) -> Cost:

@@ -281,10 +281,9 @@ class Problem(OneVersion):
 
     def with_costs(self, *, stage_cost: Cost | None = None, final_cost: Cost | None = None) -> "Problem":
         """The problem with other costs, None for the present ones. It may begin inside an obstacle if this one does."""
-        stated = {"stage_cost": stage_cost, "final_cost": final_cost}
-        return self._with(
-            **self._bound(**{name: cost for name, cost in stated.items() if cost is not None})
-        )._checked_parts()
+        stated: dict[str, Any] = {"stage_cost": stage_cost, "final_cost": final_cost}
+        changed = {name: cost for name, cost in stated.items() if cost is not None}
+        return self._with(**self._bound(**changed))._checked_parts()
 
     def _refined(self, plan: Trajectory) -> "Problem | None":
         """The problem with constraints as they are to be along a plan that misses some within its periods, or None."""
