@@ -502,38 +502,6 @@ def test_what_does_not_fit_is_refused_in_a_line(options: dict, says: str) -> Non
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("make", "says"),
-    [
-        (lambda: ls.disturbances.Unknown("d0", -1.0), "Unknown: std: got -1"),
-        (lambda: ls.disturbances.Unknown("d0", 1.0, time_constant=-1.0), "Unknown: time_constant: got -1"),
-        (lambda: ls.disturbances.Unknown("d0", 1.0, order=3), "Unknown: order: got 3"),
-        (
-            lambda: ls.disturbances.Unknown("d0", 1.0, order=2),
-            "Unknown: order: got 2 with a time constant of inf s, want 1",
-        ),
-        (
-            lambda: ls.disturbances.Unknown("d0", 1.0, time_constant=1.0, drift=0.1),
-            "Unknown: drift: got 0.1 with a time constant",
-        ),
-        (lambda: ls.disturbances.Unknown({}, 1.0), "Unknown: of: got no name"),
-        (lambda: Uncertainty(lag=-0.1), "Uncertainty: lag: got -0.1"),
-        (lambda: Uncertainty(loss=1.5), "Uncertainty: loss: got 1.5"),
-        (lambda: Uncertainty(delay=1.5), "Uncertainty: delay: got 1.5"),  # type: ignore[arg-type]
-        (lambda: Uncertainty(unknowns=["wind_x"]), "Uncertainty: unknowns: got"),  # type: ignore[list-item]
-        (
-            lambda: Uncertainty(unknowns=ls.disturbances.Unknown("d0", 1.0)),  # type: ignore[arg-type]
-            "Uncertainty: unknowns: got",
-        ),
-    ],
-)
-def test_numbers_that_make_no_sense_are_refused(make, says: str) -> None:
-    with pytest.raises(ls.InputError) as caught:
-        make()
-    assert str(caught.value).startswith(says)
-    assert "\n" not in str(caught.value)
-
-
 def test_a_solution_of_another_system_is_refused() -> None:
     system, _ = drawn(0, 1, unstable=False)
     other, _ = drawn(2, 1, unstable=False)
