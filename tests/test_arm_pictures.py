@@ -7,11 +7,11 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from linear_plans import by_hand
 from matplotlib.patches import Circle
 from mechanisms import NO_CONTACT, motors, scene
 from PIL import Image
 from planar_arm import HEIGHT, LENGTH, LINK, PlanarArm
+from tracking import track
 
 import lqrsim as ls
 from lqrsim.errors import Array
@@ -183,15 +183,7 @@ def test_a_robot_with_neither_position_nor_balls_is_drawn_by_what_is_farthest_ou
     robot = ls.MjcfRobot(file, outline=False)
     assert robot.balls is None
     plant = ls.Plant(robot, robot.scene)
-    states, dynamics, steps, dt = [robot.at()], robot.dynamics, 10, 0.02
-    controls = np.zeros((steps, len(dynamics.control_coordinates)))
-    for control in controls:
-        states.append(dynamics.step(states[-1], control, dt))
-    policy = ls.AffinePolicy(
-        gain=np.zeros((*controls.shape, len(states[0]))), offset=controls, nominal=np.array(states[:-1]), dt=dt,
-        state_coordinates=dynamics.state_coordinates, control_coordinates=dynamics.control_coordinates,
-    )  # fmt: skip
-    plan = by_hand(ls.Trajectory(np.array(states), controls, dt), policy)
+    plan = track(robot, robot.at(), np.zeros((10, len(robot.actuators))), 0.02, feedback=False)
     run = ls.simulate(plant, plan, disturbances=[ls.disturbances.ControlNoise(0.5)])
     assert run.balls is not None
     data = mujoco.MjData(plant.model)

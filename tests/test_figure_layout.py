@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from linear_plans import by_hand
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from mechanisms import NO_CONTACT, row
 from sampling import examples
+from tracking import by_hand
 
 import lqrsim as ls
 from lqrsim.errors import Array

@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from funnels_by_hand import funnel_by_hand
 from sampling import examples
 from scipy import stats
 from spoiling import content_hash, contents, rewrite
+from tracking import funnel_by_hand
 
 import lqrsim as ls
 from lqrsim.annotations import declared

@@ -11,12 +11,12 @@ import hypothesis
 import numpy as np
 import numpy.typing as npt
 import pytest
-from funnels_by_hand import funnel_by_hand
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from pucks import RADIUS, STEPS, Puck, left, plant, solution
 from sampling import examples, rarely
 from scipy import stats
+from tracking import funnel_by_hand
 
 import lqrsim as ls
 from lqrsim.cli import main

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from funnels_by_hand import funnel_by_hand
 from PIL import Image
+from tracking import funnel_by_hand
 
 import lqrsim as ls
 from lqrsim.cli import main

@@ -15,7 +15,7 @@ import browsing
 import mujoco
 import numpy as np
 import pytest
-from funnels_by_hand import funnel_by_hand
+from tracking import funnel_by_hand
 
 import lqrsim as ls
 from lqrsim.cli import main

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from linear_plans import DT, Linear, by_hand, linear
+from linear_plans import DT, Linear, linear
 from mechanisms import arm
+from tracking import open_loop
 
 import lqrsim as ls
 from lqrsim.control.plan_model import PlanDerivatives, PlanModel
@@ -80,11 +81,7 @@ def held(shoulder: float, elbow: float) -> tuple[ls.MjcfRobot, ls.Solution, ls.P
     robot = ls.MjcfRobot(scene_from_xml(xml, "two_links"))
     state, steps, dt = robot.at(shoulder=shoulder, elbow=elbow), 50, 0.02
     plan = ls.Trajectory(np.tile(state, (steps + 1, 1)), np.tile(robot.hold(state), (steps, 1)), dt)
-    policy = ls.AffinePolicy(
-        gain=np.zeros((steps, 2, 4)), offset=plan.controls, nominal=plan.states[:-1], dt=dt,
-        state_coordinates=robot.dynamics.state_coordinates, control_coordinates=robot.dynamics.control_coordinates,
-    )  # fmt: skip
-    return robot, by_hand(plan, policy), robot.problem(state, state, steps=steps, dt=dt)
+    return robot, open_loop(robot.dynamics, plan), robot.problem(state, state, steps=steps, dt=dt)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -5,8 +5,8 @@ from functools import cache
 import mujoco
 import numpy as np
 import pytest
-from linear_plans import by_hand
 from mechanisms import motors, row, scene, sled
+from tracking import open_loop, track
 
 import lqrsim as ls
 from lqrsim.disturbances import MassMismatch, Payload, Unknown
@@ -130,16 +130,11 @@ def test_a_robot_of_several_trees_is_loaded_as_a_whole(
     plant, dynamics = ls.Plant(robot, robot.scene), robot.dynamics
     assert plant.weight == pytest.approx(35.0, rel=1e-12)
     force, steps, dt = np.array([3.0, -2.0]), 20, 0.05
-    states, controls = np.zeros((steps + 1, 4)), np.tile(force, (steps, 1))
-    pushed = ls.AffinePolicy(
-        gain=np.zeros((steps, 2, 4)), offset=controls, nominal=states[:-1], dt=dt,
-        state_coordinates=dynamics.state_coordinates, control_coordinates=dynamics.control_coordinates,
-    )  # fmt: skip
-    plan = ls.smooth(robot.problem(robot.at(), robot.at(left=0.1), steps=steps, dt=dt), max_iterations=1)
-    run = ls.simulate(plant, plan, controller=pushed, disturbances=[disturbance])
+    plan = track(robot, robot.at(), np.tile(force, (steps, 1)), dt, feedback=False)
+    run = ls.simulate(plant, plan, disturbances=[disturbance])
     np.testing.assert_allclose(run.states[0, -1, 2:], force * steps * dt / masses, rtol=1e-9)
     unknown = dynamics.disturbed.with_parameters(**unknowns_of_disturbance(plant, disturbance))
-    np.testing.assert_allclose(unknown.step(states[0], force, dt)[2:], force * dt / masses, rtol=1e-9)
+    np.testing.assert_allclose(unknown.step(robot.at(), force, dt)[2:], force * dt / masses, rtol=1e-9)
 
 
 def unknowns_of_disturbance(plant: ls.Plant, disturbance: ls.disturbances.Disturbance) -> dict[str, float]:
@@ -198,11 +193,6 @@ def test_contacts_limits_and_friction_are_as_soft_as_in_the_mjcf_with_that_mass(
     loaded = robot.dynamics.disturbed.with_parameters(**{f"{body}_load": load})
     for t in range(steps):
         np.testing.assert_allclose(loaded.step(states[t], controls[t], dt), states[t + 1], rtol=0, atol=1e-10)
-    dynamics = robot.dynamics
-    pushed = ls.AffinePolicy(
-        gain=np.zeros((steps, 2, 16)), offset=controls, nominal=np.array(states[:-1]), dt=dt,
-        state_coordinates=dynamics.state_coordinates, control_coordinates=dynamics.control_coordinates,
-    )  # fmt: skip
-    plan = by_hand(ls.Trajectory(np.array(states), controls, dt), pushed)
+    plan = open_loop(robot.dynamics, ls.Trajectory(np.array(states), controls, dt))
     run = ls.simulate(ls.Plant(robot, robot.scene), plan, disturbances=[Payload(load, body)])
     np.testing.assert_allclose(run.states[0], states, rtol=0, atol=1e-10)

@@ -11,11 +11,10 @@ import av
 import mujoco
 import numpy as np
 import pytest
-from funnels_by_hand import funnel_by_hand
 from mechanisms import motors, scene, sled
 from PIL import Image, ImageSequence
 from sampling import rarely
-from tracking import hover, track
+from tracking import funnel_by_hand, hover, track
 
 import lqrsim as ls
 from lqrsim.disturbances import ControlNoise, DisplacedObstacles, Push

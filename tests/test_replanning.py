@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from funnels_by_hand import funnel_by_hand
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from live_solves import ready
 from point_mass import MARGIN, RADIUS, Oracle, balls, problem
 from sampling import examples
+from tracking import funnel_by_hand
 
 import lqrsim as ls
 from lqrsim.codegen import compiled_module

@@ -10,8 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from funnels_by_hand import funnel_by_hand
-from tracking import hover
+from tracking import funnel_by_hand, hover
 
 import lqrsim as ls
 from lqrsim.cli import main

@@ -10,10 +10,11 @@ import hypothesis
 import numpy as np
 import pytest
 from hypothesis import strategies as st
-from linear_plans import DT, Linear, by_hand, linear
+from linear_plans import DT, Linear, linear
 from sampling import examples
 from scipy.linalg import expm
 from sympy import cos, exp, sin
+from tracking import open_loop
 
 import lqrsim as ls
 from lqrsim.control.plan_model import PlanDerivatives, PlanModel, kalman_filter, recursions
@@ -397,10 +398,6 @@ def test_what_is_chosen_depends_on_no_unit_of_what_is_no_position(
         for control in controls:
             states.append(dynamics.step(states[-1], control, DT))
         plan, n = ls.Trajectory(np.array(states), controls, DT), len(start)
-        policy = ls.AffinePolicy(
-            gain=np.zeros((30, 2, n)), offset=controls, nominal=plan.states[:-1], dt=DT,
-            state_coordinates=dynamics.state_coordinates, control_coordinates=dynamics.control_coordinates,
-        )  # fmt: skip
         problem = ls.Problem(
             dynamics=dynamics, dt=DT, steps=30, initial=ls.FixedState(states[0]),
             stage_cost=ls.ControlCost(np.ones(2), about=np.zeros(2)),
@@ -409,7 +406,7 @@ def test_what_is_chosen_depends_on_no_unit_of_what_is_no_position(
         uncertainty = Uncertainty(
             start=(0.1, 0.1, 0.05 / size), control=(0.1, 0.1), measurement=(0.02, 0.02, 0.01 / size)
         )  # fmt: skip
-        solution = dataclasses.replace(by_hand(plan, policy), goal_radius=0.3)
+        solution = dataclasses.replace(open_loop(dynamics, plan), goal_radius=0.3)
         policies.append(ls.track(problem, solution, uncertainty=uncertainty).gain / (1.0, 1.0, size))
     np.testing.assert_allclose(*policies, rtol=0, atol=1e-6 * np.abs(policies[0]).max())
 

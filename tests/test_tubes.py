@@ -8,10 +8,11 @@ import hypothesis
 import numpy as np
 import pytest
 from hypothesis import strategies as st
-from linear_plans import DT, Linear, by_hand, double_integrator, linear
+from linear_plans import DT, Linear, double_integrator, linear
 from sampling import examples
 from scipy.integrate import quad
 from scipy.stats import binomtest, multivariate_normal, norm
+from tracking import by_hand
 
 import lqrsim as ls
 from lqrsim.control.controllers import Feedback

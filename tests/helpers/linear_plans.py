@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from tracking import open_loop
 
 import lqrsim as ls
 from lqrsim.errors import Array
@@ -80,26 +81,7 @@ def linear(
     for control in controls:
         states.append(system.A @ states[-1] + system.B @ control)
     plan = ls.Trajectory(np.array(states), controls, DT)
-    policy = ls.AffinePolicy(
-        gain=np.zeros((len(controls), m, n)), offset=controls, nominal=plan.states[:-1], dt=DT,
-        state_coordinates=dynamics.state_coordinates, control_coordinates=dynamics.control_coordinates,
-    )  # fmt: skip
-    return Linear(rates, inputs, pushes, problem, by_hand(plan, policy))
-
-
-def by_hand(plan: ls.Trajectory, policy: ls.AffinePolicy) -> ls.Solution:
-    """A solution made without a solver."""
-    from lqrsim.results.solution_parts import Certificate
-
-    return ls.Solution(
-        status=ls.Status.CONVERGED, detail="", policy=policy, inverse_policy=None, cost_to_go=None, cost_to_come=None,
-        trajectory=plan, iterations=(), clearance=None, gap=np.nan, solver="by hand", options={}, problem_digest="",
-        versions={},
-        certificate=Certificate(
-            cost=np.nan, start=0.0, dynamics_residual=0.0, policy_residual=0.0, limits=0.0, violation=0.0,
-            optimality=np.inf
-        ),
-    )  # fmt: skip
+    return Linear(rates, inputs, pushes, problem, open_loop(dynamics, plan))
 
 
 @cache

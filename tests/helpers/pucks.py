@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from linear_plans import by_hand
 from mechanisms import Jointed, sled
+from tracking import by_hand
 
 import lqrsim as ls
 from lqrsim.errors import Array
