@@ -170,7 +170,7 @@ def step_jacobian(rate: Rate, z: Array, n: int, p: tuple[float, ...], dt: float)
     return x[0].real, np.moveaxis(x.imag, 0, -1) / tiny
 
 
-def _functions(problem: ls.Problem, cost: Cost, n: int, size: int, first: int) -> Iterator[tuple[Any, ...]]:
+def functions_of(problem: ls.Problem, cost: Cost, n: int, size: int, first: int) -> Iterator[tuple[Any, ...]]:
     """Of each term: a function of some entries of the points, which entries, the first point it acts at, convexity."""
     for term in terms_of(cost):
         if isinstance(term, ls.QuadraticCost | ls.ControlCost):
@@ -190,7 +190,7 @@ def _functions(problem: ls.Problem, cost: Cost, n: int, size: int, first: int) -
 def cost_values(problem: ls.Problem, cost: Cost, z: Array, n: int, *, first: int) -> Array:
     """Values (k,) of a sum of costs at points (k, size), as `cost_model`."""
     value = np.zeros(len(z))
-    for function, place, skip, _ in _functions(problem, cost, n, z.shape[1], first):
+    for function, place, skip, _ in functions_of(problem, cost, n, z.shape[1], first):
         value[skip:] += function(z[skip:][:, place])
     return value
 
@@ -203,7 +203,7 @@ def cost_model(problem: ls.Problem, cost: Cost, z: Array, n: int, *, first: int)
     count, size = z.shape
     gradient, hessian = np.zeros((count, size)), np.zeros((count, size, size))
     bent = np.zeros((count, size, size))
-    for function, place, skip, convex in _functions(problem, cost, n, size, first):
+    for function, place, skip, convex in functions_of(problem, cost, n, size, first):
         slope, curve = _differentiate(function, z[skip:][:, place])
         gradient[skip:, place] += slope
         (hessian if convex else bent)[np.ix_(range(skip, count), place, place)] += curve

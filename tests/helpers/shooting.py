@@ -13,7 +13,6 @@ from scipy.optimize import minimize
 
 import lqrsim as ls
 from lqrsim.errors import Array
-from lqrsim.problem.parts import Cost, terms_of
 
 TINY = 1e-30
 
@@ -73,28 +72,14 @@ class Shooting:
     def parts(self, z: Any) -> Any:
         """Each term of the cost, (..., k)."""
         problem, points = self.problem, self.points(z)
-        parts = [part.sum(axis=-1) for part in self._of(problem.stage_cost, points[..., :-1, :])]
-        parts += self._of(problem.final_cost, points[..., -1, :])
-        return np.stack([*parts, *(self._of(problem.initial, points[..., 0, :]) if self.free else [])], axis=-1)
+        parts = self._sums(problem.stage_cost, points[..., :-1, :], 0)
+        parts += self._sums(problem.final_cost, points[..., -1:, : self.n], -1)
+        parts += self._sums(problem.initial, points[..., :1, : self.n], 0) if self.free else []
+        return np.stack(parts, axis=-1)
 
-    def _of(self, cost: Any, points: Any) -> list[Any]:
-        found = []
-        assert isinstance(cost, Cost)
-        for term in terms_of(cost):
-            if isinstance(term, ls.QuadraticCost | ls.ControlCost):
-                place = slice(0, self.n) if isinstance(term, ls.QuadraticCost) else slice(self.n, None)
-                about, weight = kkt.quadratic_at(term, self.problem.steps)
-                off = points[..., place] - about
-                found.append(0.5 * np.einsum("...i,...ij,...j->...", off, weight, off))
-            elif isinstance(term, ls.SymbolicCost):
-                formula = kkt.numeric(term.function, self.n, self.m, tuple(term.parameters), False)
-                entries = list(np.moveaxis(points, -1, 0))
-                numbers = tuple(term.parameters.values())
-                value = formula(entries[: self.n], entries[self.n :], numbers)
-                found.append(np.broadcast_to(value, points.shape[:-1]))
-            else:
-                raise TypeError(f"no oracle for {term.name}")
-        return found
+    def _sums(self, cost: Any, points: Any, first: int) -> list[Any]:
+        terms = kkt.functions_of(self.problem, cost, self.n, points.shape[-1], first)
+        return [function(points[..., skip:, place]).sum(axis=-1) for function, place, skip, _ in terms]
 
     def rows(self, z: Any, equality: bool) -> Any:
         """All equalities or all inequalities (..., k), at the steps where they apply."""
