@@ -745,7 +745,8 @@ def run_on_cluster(job: Job, shards: list[Shard], client: Any, time_limit: float
         raise InputError(f"scheduler: got no answer ({error}), {RESUME}") from None
     finally:
         with contextlib.suppress(Exception):  # the scheduler may have ended
-            client.unsubscribe_topic(job.name)
+            for topic in ("all", job.name):
+                client.unsubscribe_topic(topic)
             client.cancel(list(submitted))
 
 
