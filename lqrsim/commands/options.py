@@ -44,7 +44,7 @@ def _optional_value(info: PrimitiveTypeInfo) -> Any:
     )
 
 
-def options_of(file: str, name: str, /, **metavars: str) -> Callable[[type[Command]], type[Command]]:
+def options_of(file: str, name: str, /, **metavars: str | None) -> Callable[[type[Command]], type[Command]]:
     """Give a command options of a function or a record of the API, with its types, defaults and help.
 
     The source is parsed, for an import would take a second, for `--help` too. A command repeats the options that its
@@ -52,7 +52,7 @@ def options_of(file: str, name: str, /, **metavars: str) -> Callable[[type[Comma
 
     Args:
       file: path in the package. name: the function or class, or CLASS.METHOD.
-      **metavars: each option with its metavar.
+      **metavars: each option with its metavar; None for a flag, or where the type says it.
     """
     node: Any = _parsed(file)
     for part in name.split("."):

@@ -216,13 +216,10 @@ class StudyOptions(SetupOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+@options_of("stress/failure_search.py", "ReliabilityProblem", failure=None)
 @options_of("stress/study.py", "Study", sweep="NAME")
 class FailureOptions(StudyOptions):
     """Options of `rare`, `break` and `harden`."""
-
-    failure: Literal["collision", "miss"] = "collision"
-    """collision: the robot hits an obstacle, its trial diverges, or its controller fails. miss: it does not reach its
-    goal, which is what `lqrsim stress` calls a failure."""
 
     out: Folder = None
     """Output folder. By default runs/, the name of the command, and the name of the scenario."""

@@ -308,7 +308,7 @@ OF_C, OF_MINARI = ("number", "gains", "interpolate", "name"), ("actions", "cell"
 
 
 @dataclass(frozen=True, kw_only=True)
-@options_of("results/export_c.py", "export_c", interpolate="", name="NAME")
+@options_of("results/export_c.py", "export_c", number=None, gains=None, interpolate=None, name="NAME")
 class Export:
     """Write a policy as C99, or runs as a data set of Minari.
 
@@ -330,10 +330,6 @@ class Export:
     For --minari a file from `lqrsim simulate`, or a folder from `lqrsim stress`, whose trials are run again."""
     c: Annotated[Path | None, optional("FOLDER")] = None
     """Folder for the C files. Files of their names are replaced."""
-    number: Literal["float", "double"] = "float"
-    """Type of the numbers in C, except the time, which is a double."""
-    gains: Literal["full", "int16"] = "full"
-    """int16: matrices in C take 16 bits an entry. The largest change of the commands is printed and in the header."""
     minari: Annotated[str | None, optional("NAMESPACE/NAME-vVERSION")] = None
     """Name of the data set, which must be new."""
     actions: Literal["normalized", "controls"] = "normalized"

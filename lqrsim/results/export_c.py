@@ -10,12 +10,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from lqrsim.annotations import Line, OneOf, Want, checked
+from lqrsim.annotations import Line, Want, checked
 from lqrsim.errors import Array, InputError, check_path, excerpt
 from lqrsim.results.archive import write_text
 from lqrsim.results.coordinates import Coordinates
@@ -38,7 +38,6 @@ LARGEST = 32767  # largest integer in 16 bits
 # The tolerance of main.c, relative to the largest sum of magnitudes in a command: well above rounding, about 1e-15
 # in double and 1e-6 in float over some dozen sums, and above 1/65534, the rounding of one gain to 16 bits.
 TOLERANCES = {"double": 1e-11, "float": 1e-5, "int16": 1e-3}
-NUMBERS, GAINS = ("float", "double"), ("full", "int16")
 EXPORTED = "a Solution, an AffinePolicy, such as of track, or an OutputFeedbackPolicy, such as OffsetFree(...).policy"
 DTYPES: dict[str, Any] = {"float": np.float32, "double": np.float64}
 # The template of the source, and what the header says of it.
@@ -92,8 +91,8 @@ def export_c(
     policy: Annotated[Solution | AffinePolicy | OutputFeedbackPolicy, Want(EXPORTED)],
     folder: str | os.PathLike[str],
     *,
-    number: Annotated[str, OneOf(NUMBERS)] = "float",
-    gains: Annotated[str, OneOf(GAINS)] = "full",
+    number: Literal["float", "double"] = "float",
+    gains: Literal["full", "int16"] = "full",
     interpolate: bool = False,
     name: Annotated[str, Want("a name"), 40] = "policy",
 ) -> ExportedC:
@@ -110,8 +109,8 @@ def export_c(
       policy: a Solution, whose policy is exported; a policy, as from `track`; or a policy with a filter, as
         `OffsetFree(...).policy`. A controller that solves while it runs, or a function, cannot be exported.
       folder: the folder for the files. Files of these names are replaced.
-      number: the type of all numbers except the time, "float" or "double".
-      gains: "full" or "int16": whether matrices are stored in 16 bits, each entry relative to its largest magnitude.
+      number: the type of all numbers except the time, which is a double.
+      gains: how matrices are stored; int16 takes 16 bits an entry, relative to its largest magnitude.
       interpolate: whether to interpolate between the laws of two knots, as `AffinePolicy` does; not with a filter.
       name: name of the files and the functions: lower-case letters, digits and underscores, beginning with a letter;
         not that of a header of C, such as math.

@@ -13,13 +13,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from lqrsim.annotations import Bounds, Count, Index, OneOf, Seed, TextProgress, Want, checked
+from lqrsim.annotations import Bounds, Count, Index, Seed, TextProgress, Want, checked
 from lqrsim.control.controllers import ControllerLike, as_controller
 from lqrsim.errors import Array, InputError, check_array, check_path, excerpt, shaped
 from lqrsim.machine import changed, description, versions
@@ -236,10 +236,11 @@ class ReliabilityProblem(Study):
     """A study, and a definition of its failure.
 
     Attributes:
-      failure: "collision": the robot collides, its trial diverges, or its controller fails; "miss": it misses its goal.
+      failure: with collision the robot collides, its trial diverges, or its controller fails; with miss it does not
+        reach its goal, which is what a campaign calls a failure.
     """
 
-    failure: Annotated[str, OneOf(FAILURES)] = "collision"
+    failure: Literal["collision", "miss"] = "collision"
 
     @cached_property
     def score(self) -> TrialScore:
