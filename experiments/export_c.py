@@ -80,7 +80,7 @@ class CompiledLaw(ls.Controller):
         policy: ls.AffinePolicy | OutputFeedbackPolicy,
         folder: Path,
         *,
-        number: str = "double",
+        number: Any = "double",  # "float" or "double"
         **options: Any,
     ) -> None:
         self.policy, self.number, self.sees_losses = policy, number, isinstance(policy, OutputFeedbackPolicy)
