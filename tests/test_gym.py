@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import mjcf_files
+import mechanisms
 import mujoco
 import numpy as np
 import pytest
@@ -253,7 +253,7 @@ def test_wrong_environments_are_refused(drive_solution: ls.Solution, quadrotor_s
 
 def test_any_mjcf_and_any_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("cart.xml").write_text(mjcf_files.draw("cart", 0).xml, encoding="utf-8")
+    Path("cart.xml").write_text(mechanisms.draw("cart", 0).xml, encoding="utf-8")
     Path("mine.py").write_text(
         "import lqrsim as ls\n\ndef push(steps=20):\n    return ls.scenarios.mjcf('cart.xml', steps=steps)\n",
         encoding="utf-8",

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import mjcf_files
+import mechanisms
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -830,7 +830,7 @@ class TestRareEnds:
 
     def test_where_mujoco_can_not_go(self) -> None:
         """From no number, backwards in time, and beyond all numbers; and rotations that are whole turns."""
-        drawn = mjcf_files.draw("cart", 3, "Euler")
+        drawn = mechanisms.draw("cart", 3, "Euler")
         dynamics = ls.MjcfRobot(scene_from_xml(drawn.xml, "cart")).dynamics
         for x, dt in (([np.nan, 0, 0, 0], 0.005), ([0.1, 0, 0, 0], -0.005)):
             TestParts.steps(dynamics, np.array(x, dtype=float), np.zeros(1), dt)
@@ -1156,7 +1156,7 @@ class TestParts:
     @pytest.mark.parametrize("kind", ["box", "arm", *rarely("cart", "wheel")])
     def test_mujoco(self, kind: str) -> None:
         """MuJoCo's own steps, called from plain Python and from compiled code; it starts each from nothing."""
-        drawn = mjcf_files.draw(kind, 3, "Euler")  # whose steps can be had in parts
+        drawn = mechanisms.draw(kind, 3, "Euler")  # whose steps can be had in parts
         robot = ls.MjcfRobot(scene_from_xml(drawn.xml, kind), turns_about="z" if kind == "box" else None)
         dynamics = robot.dynamics
         n, m = len(dynamics.state_coordinates), len(dynamics.control_coordinates)
@@ -1188,7 +1188,7 @@ class TestParts:
 
     def test_threads_that_help_mujoco(self) -> None:
         """With a helper that never comes, one thread does all columns; and a helper all that it finds to do."""
-        drawn = mjcf_files.draw("cart", 3, "Euler")
+        drawn = mechanisms.draw("cart", 3, "Euler")
         dynamics = ls.MjcfRobot(scene_from_xml(drawn.xml, "cart")).dynamics
         assert isinstance(dynamics, MjcfDynamics)
         x, u, n, m, team = np.array([0.1, 0.4, -0.2, 0.3]), np.array([0.5]), 4, 1, dynamics.physics.team

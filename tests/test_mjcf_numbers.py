@@ -4,7 +4,7 @@ import pickle
 from dataclasses import replace
 from typing import Any
 
-import mjcf_files
+import mechanisms
 import numpy as np
 import pytest
 from mechanisms import NO_CONTACT, motors, row, scene, sled
@@ -213,7 +213,7 @@ def swing(robot: ls.MjcfRobot) -> ls.Problem:
 
 
 def test_a_problem_takes_them_and_compiles_nothing() -> None:
-    robot = ls.MjcfRobot(scene_from_xml(mjcf_files.draw("cart", 4, "implicitfast").xml, "cart"))
+    robot = ls.MjcfRobot(scene_from_xml(mechanisms.draw("cart", 4, "implicitfast").xml, "cart"))
     problem, plant = swing(robot), ls.Plant(robot, robot.scene)
     before = ls.smooth(problem)
     ls.simulate(plant, before)

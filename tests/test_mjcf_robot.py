@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import mjcf_files
+import mechanisms
 import mujoco
 import numpy as np
 import pytest
@@ -34,8 +34,8 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 @cache
-def robot_of(kind: str, seed: int, integrator: str | None = None) -> tuple[ls.MjcfRobot, mjcf_files.Drawn]:
-    drawn = mjcf_files.draw(kind, seed, integrator)
+def robot_of(kind: str, seed: int, integrator: str | None = None) -> tuple[ls.MjcfRobot, mechanisms.Drawn]:
+    drawn = mechanisms.draw(kind, seed, integrator)
     axis = (None, "x", "y", "z")[seed % 4] if kind in ("arm", "box") else None  # those with a ball or free joint
     return ls.MjcfRobot(scene_from_xml(drawn.xml, kind), turns_about=axis), drawn
 
@@ -59,7 +59,7 @@ def stepped(robot: ls.MjcfRobot, state: Array, control: Array, substeps: int, *,
     return robot.dynamics.state_coordinates.nearest(after, near)
 
 
-@pytest.mark.parametrize("kind", mjcf_files.KINDS)
+@pytest.mark.parametrize("kind", mechanisms.KINDS)
 @settings(max_examples=examples(15))
 @given(seed=SEEDS)
 def test_a_control_period_is_that_many_steps_of_mujoco(kind: str, seed: int) -> None:
@@ -71,7 +71,7 @@ def test_a_control_period_is_that_many_steps_of_mujoco(kind: str, seed: int) -> 
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", mjcf_files.KINDS)
+@pytest.mark.parametrize("kind", mechanisms.KINDS)
 @settings(max_examples=examples(10))
 @given(seed=SEEDS)
 def test_its_derivatives_are_those_of_the_steps(kind: str, seed: int) -> None:
@@ -175,7 +175,7 @@ def test_a_resting_box_is_linearised_through_its_contacts() -> None:
 
 
 @pytest.mark.parametrize("integrator", ["RK4", "implicitfast"])
-@pytest.mark.parametrize("kind", mjcf_files.KINDS)
+@pytest.mark.parametrize("kind", mechanisms.KINDS)
 def test_columns_of_a_helper_have_the_bits_of_ones_own(kind: str, integrator: str) -> None:
     """A helper that computes all columns of a job, a physics step, whichever thread would have got there first
     otherwise. Where the step is curved, it has differences to both sides.
@@ -210,7 +210,7 @@ def test_columns_of_a_helper_have_the_bits_of_ones_own(kind: str, integrator: st
         team[kernel.STOP] = 0
 
 
-@pytest.mark.parametrize("kind", mjcf_files.KINDS)
+@pytest.mark.parametrize("kind", mechanisms.KINDS)
 def test_helpers_change_no_bit(kind: str) -> None:
     robot, drawn = robot_of(kind, 11)
     dynamics, dt = robot.dynamics, 0.005 * drawn.substeps
@@ -244,7 +244,7 @@ def test_threads_do_not_disturb_each_other() -> None:
         np.testing.assert_array_equal(one, expected)
 
 
-@pytest.mark.parametrize("kind", mjcf_files.KINDS)
+@pytest.mark.parametrize("kind", mechanisms.KINDS)
 @settings(max_examples=examples(20))
 @given(seed=SEEDS)
 def test_states_and_mujocos_numbers_are_the_same_place(kind: str, seed: int) -> None:
@@ -294,7 +294,7 @@ def test_names_units_limits_and_what_wraps() -> None:
 
 
 def test_states_by_name_and_keyframe() -> None:
-    xml = mjcf_files.draw("cart", 1).xml.replace(
+    xml = mechanisms.draw("cart", 1).xml.replace(
         "</mujoco>", '<keyframe><key name="tilted" qpos="0.1 0.5" qvel="1 2"/></keyframe></mujoco>'
     )
     robot = ls.MjcfRobot(scene_from_xml(xml, "cart"))
@@ -966,7 +966,7 @@ def test_a_start_far_from_a_closed_loop_is_refused() -> None:
 
 
 def test_a_light_where_there_is_none() -> None:
-    bare = mjcf_files.draw("cart", 0).xml
+    bare = mechanisms.draw("cart", 0).xml
     assert "<camera" not in bare
     model = ls.MjcfRobot(scene_from_xml(bare, "cart")).scene.model
     assert (model.ncam, model.nlight) == (0, 1)
@@ -1143,7 +1143,7 @@ def test_what_it_cannot_touch_is_no_obstacle() -> None:
     """By MuJoCo's bits: the cart shares one with the post that is near, and none with the other."""
     posts = '<geom name="near" size="0.1" pos="2 0 0"/>'
     posts += '<geom name="other" size="0.1" pos="3 0 0" contype="2" conaffinity="2"/>'
-    xml = mjcf_files.draw("cart", 0).xml.replace("<worldbody>", f"<worldbody>{posts}")
+    xml = mechanisms.draw("cart", 0).xml.replace("<worldbody>", f"<worldbody>{posts}")
     robot = ls.MjcfRobot(scene_from_xml(xml, "cart"), position=())
     assert robot.scene.world.names == ("near",)
     assert ls.Plant(robot, robot.scene).obstacles == ("near",)
@@ -1179,9 +1179,8 @@ def test_what_has_no_name_gets_one_in_all_sections_and_included_files(
 
 
 def test_an_obstacle_that_is_half_of_a_pair_is_named() -> None:
-    xml = mjcf_files.draw("cart", 0).xml.replace("<worldbody>", '<worldbody><geom name="post" size="0.1" pos="2 0 0"/>')
-    pair = '<contact><pair geom1="post" geom2="unnamed_geom_0"/></contact></mujoco>'
-    xml = xml.replace('<geom type="box"', '<geom name="unnamed_geom_0" type="box"').replace("</mujoco>", pair)
+    xml = mechanisms.draw("cart", 0).xml.replace("<worldbody>", '<worldbody><geom name="post" size="0.1" pos="2 0 0"/>')
+    xml = xml.replace("</mujoco>", '<contact><pair geom1="post" geom2="cart"/></contact></mujoco>')
     with pytest.raises(InputError, match=r"geom 'post': got an obstacle in a <contact><pair>"):
         ls.MjcfRobot(scene_from_xml(xml, "cart"))
 

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-import mjcf_files
+import mechanisms
 import numpy as np
 import pytest
 from mechanisms import motors, sled
@@ -20,7 +20,7 @@ from lqrsim.scenarios.references import from_anywhere, names_code, resolve
 def cart(tmp_path: Path) -> Path:
     file = tmp_path / "cart.xml"
     key = '<keyframe><key name="tilted" qpos="0.1 0.5"/></keyframe></mujoco>'
-    file.write_text(mjcf_files.draw("cart", 3, "implicitfast").xml.replace("</mujoco>", key), encoding="utf-8")
+    file.write_text(mechanisms.draw("cart", 3, "implicitfast").xml.replace("</mujoco>", key), encoding="utf-8")
     return file
 
 
@@ -70,7 +70,7 @@ def test_start_and_goal_are_at_rest_where_contacts_carry_the_robot(tmp_path: Pat
 def test_a_box_among_posts_keeps_clear_of_them(tmp_path: Path) -> None:
     file = tmp_path / "box.xml"
     post = '<geom name="post" type="cylinder" size="0.1 1" pos="2 0 1"/></worldbody>'
-    file.write_text(mjcf_files.draw("box", 3, "Euler").xml.replace("</worldbody>", post), encoding="utf-8")
+    file.write_text(mechanisms.draw("box", 3, "Euler").xml.replace("</worldbody>", post), encoding="utf-8")
     scenario = ls.scenarios.mjcf(str(file), start={"z": 1.0}, goal={"x": 3.0, "z": 1.0})
     (cost,) = scenario.problem.obstacle_costs
     assert cost.world.names == ("post",)  # a box can stand on the floor

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from mechanisms import NO_CONTACT, scene
 from numpy.random import Generator
 from scipy.optimize import least_squares
 
-_FREE = 'contype="0" conaffinity="0"'
 _TRIES = 6  # starts of the search for rest
 _REST = 1e-8  # N, N m and rates within which something rests
 _INTEGRALS = {mujoco.mjtDyn.mjDYN_PID: (0, 1), mujoco.mjtDyn.mjDYN_DCMOTOR: (8, 7)}  # entries of imax and slewmax
@@ -42,7 +42,7 @@ def _arm(rng: Generator) -> Actuated:
         bodies += (
             f'<body name="{name}" pos="{0.3 if bodies else 0} 0 0"><joint name="{name}" axis="0 1 0" damping="1"'
             f' armature="0.05" stiffness="{rng.uniform(15, 30)}" springref="{rng.uniform(-40, 40)}" {_joint(rng)}/>'
-            f'<geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="{rng.uniform(0.1, 0.5)}" {_FREE}/>'
+            f'<geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="{rng.uniform(0.1, 0.5)}" {NO_CONTACT}/>'
             f'<site name="{name}_tip" pos="0.3 0 0"/><site name="{name}_side" pos="0.15 0 0.03"/>'
         )
     bodies += "</body>" * count
@@ -80,7 +80,7 @@ def _gantry(rng: Generator) -> Actuated:
         slope = rng.uniform(0.3, 1)
         bodies += (
             f'<body name="s{i}" pos="0 {i} 0"><joint name="s{i}" type="slide" axis="1 0 {slope}" damping="10"'
-            f' stiffness="{rng.uniform(50, 200)}" {_joint(rng)}/><geom size="0.05" mass="0.4" {_FREE}/></body>'
+            f' stiffness="{rng.uniform(50, 200)}" {_joint(rng)}/><geom size="0.05" mass="0.4" {NO_CONTACT}/></body>'
         )
         for k in range(int(rng.integers(1, 3))):
             kind, text = _actuator(rng, f'name="a{i}{k}" joint="s{i}" gear="{_gear(rng)}"')
@@ -92,7 +92,7 @@ def _gantry(rng: Generator) -> Actuated:
 def _ball(rng: Generator) -> Actuated:
     body = (
         f'<body name="b" pos="0 0 0"><joint name="b" type="ball" damping="1" armature="0.05" stiffness="20"/>'
-        f'<geom type="capsule" fromto="0 0 0 0.2 0.1 0.1" size="0.02" mass="{rng.uniform(0.1, 0.5)}" {_FREE}/>'
+        f'<geom type="capsule" fromto="0 0 0 0.2 0.1 0.1" size="0.02" mass="{rng.uniform(0.1, 0.5)}" {NO_CONTACT}/>'
         '<site name="tip"/></body><site name="post"/>'
     )
     actuators, kinds = "", []
@@ -121,15 +121,14 @@ def _free(rng: Generator) -> Actuated:
         lag = rng.choice(["", 'dyntype="filter" dynprm="0.05"', 'dyntype="filterexact" dynprm="0.001"'])
         actuators += f'<general name="a{k}" site="s{k}" gear="{gear}" gainprm="{rng.uniform(0.5, 3)}" {lag} {limits}/>'
         kinds.append("thruster" + (f" with {lag.split()[0]}" if lag else ""))
-    body = (
-        f'<body name="f"><freejoint name="f"/><geom type="box" size="0.2 0.1 0.05" mass="0.8" {_FREE}/>{sites}</body>'
-    )
+    box = f'<geom type="box" size="0.2 0.1 0.05" mass="0.8" {NO_CONTACT}/>'
+    body = f'<body name="f"><freejoint name="f"/>{box}{sites}</body>'
     return Actuated(_file(body, "", actuators), tuple(kinds), {"f_rx": float(rng.uniform(-1, 1))})
 
 
 def _file(bodies: str, tendons: str, actuators: str) -> str:
-    return f"""<mujoco><option timestep="0.002" integrator="implicitfast"/><compiler autolimits="true"/><worldbody>
-      {bodies}</worldbody><tendon>{tendons}</tendon><actuator>{actuators}</actuator></mujoco>"""
+    option = 'timestep="0.002" integrator="implicitfast"'
+    return scene(bodies, actuators, more=f"<tendon>{tendons}</tendon>", option=option, compiler="")
 
 
 def _gear(rng: Generator) -> float:

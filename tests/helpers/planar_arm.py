@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from mechanisms import Jointed
+from mechanisms import Jointed, motors, scene
 
 import lqrsim as ls
 
@@ -76,20 +76,9 @@ class PlanarArm(Jointed):
             place = f"0 0 {HEIGHT}" if i == 0 else f"{LENGTH} 0 0"
             hinge = f'<joint name="{joint}" axis="0 0 1" damping="{DAMPING}" armature="{INERTIA}"/>'
             bodies += f'<body name="{body}" pos="{place}">{hinge}{link.format(i)}{site.format(i, LENGTH)}'
-        motors = "".join(
-            f'<motor name="{joint}" joint="{joint}" ctrllimited="true" ctrlrange="-0.6 0.6"/>'
-            for joint in ("shoulder", "elbow", "wrist")
-        )
-        return f"""
-<mujoco model="planar arm">
-  <option timestep="0.01" integrator="RK4"/>
-  <visual><global offwidth="1280" offheight="720"/></visual>
-  <worldbody>
-    <light pos="0 0 5"/>
-    {things}
-    {bodies}{3 * end}
-  </worldbody>
-  <contact><exclude body1="upper" body2="fore"/><exclude body1="fore" body2="hand"/></contact>
-  <actuator>{motors}</actuator>
-</mujoco>
-"""
+        return scene(
+            bodies + 3 * end, motors(PlanarArm.joints, [0.6] * 3), things='<light pos="0 0 5"/>' + things, compiler="",
+            option='timestep="0.01" integrator="RK4"',
+            before='<visual><global offwidth="1280" offheight="720"/></visual>',
+            more='<contact><exclude body1="upper" body2="fore"/><exclude body1="fore" body2="hand"/></contact>',
+        )  # fmt: skip

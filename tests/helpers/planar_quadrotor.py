@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from mechanisms import Jointed
+from mechanisms import NO_CONTACT, Jointed, scene
 from oracle.planar_quadrotor import ARM, DRAG, INERTIA, MASS, rate
 
 import lqrsim as ls
@@ -47,32 +47,20 @@ def mjcf(things: str = BLOCK, *, level: str = "x", y: float = 0.0, before: str =
     """The drone in the plane of z and another axis, among these obstacles; it rolls from that axis towards z."""
     axis, normal = ("1 0 0", "0 -1 0") if level == "x" else ("0 1 0", "1 0 0")
     place, side = (f"0 {y} 0", "{} 0 0") if level == "x" else (f"{y} 0 0", "0 {} 0")
-    return f"""
-<mujoco model="planar">
-  <option timestep="0.01" integrator="RK4" gravity="0 0 -{GRAVITY}">{flags}</option>
-  <visual><global offwidth="1280" offheight="720"/></visual>
-  <worldbody>
-    <light pos="0 -4 6"/>
-    {things}
-    {before}
-    <body name="drone" pos="{place}">
+    drone = f"""<body name="drone" pos="{place}">
       <joint name="across" type="slide" axis="{axis}" damping="{DRAG}"/>
       <joint name="up" type="slide" axis="0 0 1" damping="{DRAG}"/>
       <joint name="roll" type="hinge" axis="{normal}"/>
       <inertial pos="0 0 0" mass="{MASS}" diaginertia="{INERTIA} {INERTIA} {INERTIA}"/>
       <geom name="ball" size="0.2" rgba="0.9 0.4 0.1 0.6"/>
-      <geom name="bar" type="capsule" fromto="{side.format(-ARM)} {side.format(ARM)}" size="0.03"
-        contype="0" conaffinity="0"/>
-      <site name="left" pos="{side.format(-ARM)}"/>
-      <site name="right" pos="{side.format(ARM)}"/>
-    </body>
-  </worldbody>
-  <actuator>
-    <general name="left" site="left" gear="0 0 1 0 0 0"/>
-    <general name="right" site="right" gear="0 0 1 0 0 0"/>
-  </actuator>
-</mujoco>
-"""
+      <geom name="bar" type="capsule" fromto="{side.format(-ARM)} {side.format(ARM)}" size="0.03" {NO_CONTACT}/>
+      <site name="left" pos="{side.format(-ARM)}"/><site name="right" pos="{side.format(ARM)}"/></body>"""
+    rotors = "".join(f'<general name="{one}" site="{one}" gear="0 0 1 0 0 0"/>' for one in ("left", "right"))
+    return scene(
+        before + drone, rotors, things=f'<light pos="0 -4 6"/>{things}', compiler="",
+        option=f'timestep="0.01" integrator="RK4" gravity="0 0 -{GRAVITY}"',
+        before=f'<option>{flags}</option><visual><global offwidth="1280" offheight="720"/></visual>',
+    )  # fmt: skip
 
 
 def problem(
