@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from lqrsim.disturbances import (
     Push,
 )
 from lqrsim.simulation.disturbances import preset
-from lqrsim.stress.failure_search import PrescribedDraws, TrialScore, collision_score, miss_score
+from lqrsim.stress.failure_search import PrescribedDraws, ReliabilityProblem, TrialScore, collision_score, miss_score
 from lqrsim.stress.reliability import NoFailure, failure_probability, smallest_failure
 from lqrsim.stress.statistics import rate
 from lqrsim.templates.my_robot.my_robot import MyRobot
@@ -426,6 +427,27 @@ def test_a_quadrotor_against_plain_monte_carlo(quadrotor: ls.Scenario, quadrotor
     # The numbers of a failure are all that is needed to see it again.
     again = trials.rollout(found.failures[:1], frames=False)
     assert again.outcome == ("collided",)
+
+
+@pytest.mark.parametrize("obstacles", [0, 3])
+@pytest.mark.parametrize("goal", ["m", "of the way"])
+@pytest.mark.parametrize("failure", ["collision", "miss"])
+def test_levels_have_a_unit_where_all_scores_have_one(
+    failure: Any, goal: str, obstacles: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A miss of a goal without a position, among obstacles, may be metres from a collision or a share of the way."""
+    if failure == "collision" and not obstacles:
+        return  # is refused
+    score = Mock(solution=Mock(target=Mock(unit=goal)))
+    score.plant.world = range(obstacles)
+    monkeypatch.setattr(ReliabilityProblem, "score", score)
+    monkeypatch.setattr(ReliabilityProblem, "summary", lambda self: "")
+    lines = list[str]()
+    tell = ReliabilityProblem("quadrotor", failure=failure)._begin(lines.append)
+    assert tell is not None
+    tell(-0.5)
+    units = {"m"} if failure == "collision" else {goal} | ({"m"} if obstacles else set())
+    assert lines[1:] == [f"level: 0.5 {units.pop() + ' ' if len(units) == 1 else ''}from failing"]
 
 
 @pytest.mark.parametrize("seed", range(3))

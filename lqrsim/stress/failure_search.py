@@ -345,7 +345,9 @@ class ReliabilityProblem(Study):
         if report is None:
             return None
         report(self.summary())
-        unit = "m" if len(self.score.plant.world) else self.score.solution.target.unit
+        units = {self.score.solution.target.unit if self.failure == "miss" else "m"}
+        units |= {"m"} if len(self.score.plant.world) else set()
+        unit = f" {units.pop()}" if len(units) == 1 else ""  # else the level may be in either; see `miss_score`
         last, when = math.nan, 0.0
 
         def report_level(level: float) -> None:
@@ -353,7 +355,7 @@ class ReliabilityProblem(Study):
             now = time.monotonic()
             tie = ", where scores tie: drawing more" if level == last else ""
             if not tie or now - when > TIE_REPORT_EVERY:
-                report(f"level: {-level:.3g} {unit} from failing{tie}" if level < 0 else "level: failing")
+                report(f"level: {-level:.3g}{unit} from failing{tie}" if level < 0 else "level: failing")
                 when = now
             last = level
 
