@@ -332,11 +332,7 @@ class ReliabilityProblem(Study):
         if score(np.zeros((1, score.size)))[0] > 0:
             got = f"{self.policy}, which fails with all random numbers at zero"
             raise InputError(f"policy: got {got}, want one that succeeds when undisturbed")
-
-        def result(point: object) -> SmallestFailure | None:
-            return SmallestFailure(self, point, options) if isinstance(point, reliability.DesignPoint) else None
-
-        with keeping(result):
+        with keeping(lambda done: None if done is None else SmallestFailure(self, done, options)):
             point = reliability.smallest_failure(score, score.size, level=level, progress=progress, **options)
         return SmallestFailure(self, point, options)
 
