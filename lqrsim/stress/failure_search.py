@@ -344,16 +344,16 @@ class ReliabilityProblem(Study):
         units = {self.score.solution.target.unit if self.failure == "miss" else "m"}
         units |= {"m"} if len(self.score.plant.world) else set()
         unit = f" {units.pop()}" if len(units) == 1 else ""  # else the level may be in either; see `miss_score`
-        last, when = math.nan, 0.0
+        level_before, reported = math.nan, 0.0
 
         def report_level(level: float) -> None:
-            nonlocal last, when
+            nonlocal level_before, reported
             now = time.monotonic()
-            tie = ", where scores tie: drawing more" if level == last else ""
-            if not tie or now - when > TIE_REPORT_EVERY:
+            tie = ", where scores tie: drawing more" if level == level_before else ""
+            if not tie or now - reported > TIE_REPORT_EVERY:
                 report(f"level: {-level:.3g}{unit} from failing{tie}" if level < 0 else "level: failing")
-                when = now
-            last = level
+                reported = now
+            level_before = level
 
         return report_level
 

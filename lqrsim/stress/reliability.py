@@ -300,9 +300,9 @@ class _Splitting:
                 if number == 0:
                     moved, moved_scores = self.draw(rng)
                 else:
-                    last = levels[number - 1]
-                    moved, moved_scores = self.resample(vectors, scores, last, rng)
-                    moved, moved_scores, _ = self.move(moved, moved_scores, last, step_sizes[number - 1], rng)
+                    below, step_size = levels[number - 1], step_sizes[number - 1]
+                    moved, moved_scores = self.resample(vectors, scores, below, rng)
+                    moved, moved_scores, _ = self.move(moved, moved_scores, below, step_size, rng)
                 above = moved_scores > level
                 survivors.append((moved[above], moved_scores[above]))
             vectors, scores = (np.concatenate(parts) for parts in zip(*survivors, strict=True))

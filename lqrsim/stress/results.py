@@ -488,7 +488,7 @@ class Manifest:
         """The manifest of an object of JSON. Raises InputError unless all fields are valid and the hashes fit."""
         _check_names("manifest", said, [field.name for field in fields(cls)])
         manifest = cls(**said)
-        if manifest.sha256 != _seal(said):
+        if manifest.sha256 != sha256(canonical({name: value for name, value in said.items() if name != "sha256"})):
             raise InputError("sha256: got a hash that does not fit the content, want an unchanged file")
         _check_names("campaign", manifest.campaign, CAMPAIGN_FIELDS)
         cells = [[cell.policy, cell.sweep, cell.strength] for cell in manifest.settings.cells]
@@ -512,7 +512,7 @@ def write_manifest(folder: Path, contents: dict[str, Any]) -> None:
     """Write the manifest: `contents`, with format and hashes added. Raises InputError."""
     manifest = {"format": FORMAT, "version": VERSION, **contents}
     manifest["digest"] = digest_of_rows(manifest)
-    manifest["sha256"] = _seal(manifest)
+    manifest["sha256"] = sha256(canonical(manifest))
     Manifest.of(parse(json.dumps(manifest)))  # without sorting: the sweeps define the order of the cells
     write(json.dumps(manifest, indent=1).encode(), folder / MANIFEST)
 
@@ -539,10 +539,6 @@ def _check_names(field: str, part: Mapping[str, Any], names: Sequence[str]) -> N
     if wrong := sorted(part.keys() ^ set(names)):
         got = f"{'' if wrong[0] in part else 'none of '}{excerpt(wrong[0])}"
         raise InputError(f"{field}: got {got}, want exactly {', '.join(names)}")
-
-
-def _seal(manifest: Mapping[str, Any]) -> str:
-    return sha256(canonical({name: value for name, value in manifest.items() if name != "sha256"}))
 
 
 def digest_of_rows(manifest: Mapping[str, Any]) -> str:
