@@ -103,21 +103,14 @@ class Outcomes:
         """The success rate with its intervals."""
         reached, trials = int(succeeded(self).sum()), len(self)
         exact, band = statistics.rate(reached, trials), statistics.rate(reached, trials, method="wilson")
-        if alike := self._alike():
+        # Equal outcomes alone do not show that all trials are the same run: random trials may end alike. Nor are trials
+        # that were not simulated, or that differ although nothing was drawn.
+        alike = self.deterministic and not np.isnan(self.ended).any() and len(set(self.outcome.tolist())) == 1
+        for values in (self.ended, self.rms, self.worst, self.effort):
+            alike = alike and np.array_equal(values, np.full_like(values, values[0]), equal_nan=True)
+        if alike:
             exact = band = Estimate(exact.value, exact.value, exact.value)
         return Success(reached, trials, exact, band, alike)
-
-    def _alike(self) -> bool:
-        """Whether nothing was drawn, as at strength 0, so that all trials are the same run.
-
-        Equal outcomes do not show it: random trials may end alike. Trials that were not simulated do not count, nor do
-        trials that differ although nothing was drawn.
-        """
-        if not self.deterministic or np.isnan(self.ended).any():
-            return False
-        numbers = (self.ended, self.rms, self.worst, self.effort)
-        same = all(np.array_equal(values, np.full_like(values, values[0]), equal_nan=True) for values in numbers)
-        return same and len(set(self.outcome.tolist())) == 1
 
     @checked
     def first(self, count: Count) -> "Outcomes":
