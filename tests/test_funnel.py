@@ -227,7 +227,6 @@ def test_refused(ice: ls.Plant, wrong: dict[str, Any], said: str) -> None:
     with pytest.raises(InputError) as caught:
         ls.funnel(**({"plant": ice, "solution": PLAN} | wrong))
     assert said in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("strength", [5.0, 1e-9])

@@ -407,7 +407,6 @@ def test_wrong_options_are_refused_before_anything_is_solved(
     with pytest.raises(ls.InputError) as refused:
         ls.stress.harden(problem, **options)
     assert str(refused.value).startswith(says) or says in str(refused.value)
-    assert "\n" not in str(refused.value)
 
 
 def refuse(why: str) -> Callable[..., Any]:

@@ -1243,9 +1243,8 @@ BAD = {
 @pytest.mark.parametrize("which", BAD)
 def test_what_states_do_not_describe_is_refused(which: str) -> None:
     text, message = BAD[which]
-    with pytest.raises(InputError, match=message) as refused:
+    with pytest.raises(InputError, match=message):
         ls.MjcfRobot(scene_from_xml(text, "bad"))
-    assert "\n" not in str(refused.value)
 
 
 def test_bad_arguments_are_named() -> None:

@@ -323,9 +323,8 @@ def test_a_robot_in_another_plane_fits_with_its_plane_and_where_it_is() -> None:
     ],
 )  # fmt: skip
 def test_a_robot_of_another_plane_is_refused_with_the_remedy(robot, scene, message) -> None:
-    with pytest.raises(ls.InputError, match=message) as refused:
+    with pytest.raises(ls.InputError, match=message):
         fitted(robot, **scene)
-    assert "\n" not in str(refused.value)
 
 
 @settings(max_examples=examples(20))
