@@ -190,19 +190,6 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
     results = ls.stress.run_campaign(campaign, place.folder / "campaign", workers=0)
     score = ls.stress.TrialScore(place.plant, place.solution, [ControlNoise(0.5)], threads=1)
     cell, rates = results.cells[0], results.rates()
-    fields = (
-        "plant",
-        "solution",
-        "disturbances",
-        "controller",
-        "failure",
-        "goal_radius",
-        "goal_tolerance",
-        "contacts",
-        "batch",
-        "threads",
-        "simulations",
-    )
     searching = {"score": line, "size": 3, "seed": 0}
     # One in five or so fails.
     reliability = ls.stress.ReliabilityProblem(reference, policy="open_loop", failure="miss", goal_radius=0.0565)
@@ -242,7 +229,7 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
             f"Results.{name}": ({"self": results, "shard": next(results.shards())},)
             for name in ("path", "table")
         },
-        "TrialScore": ({field: getattr(score, field) for field in fields}, 0.5),
+        "TrialScore": ({field.name: getattr(score, field.name) for field in dataclasses.fields(score)}, 0.5),
         "TrialScore.__call__": ({"self": score, "numbers": np.zeros((2, score.size))},),
         "TrialScore.rollout": ({"self": score, "numbers": np.zeros((2, score.size)), "frames": False},),
         "collision_score": ({"rollout": place.rollout, "first": 1},),
