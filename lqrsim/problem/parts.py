@@ -112,7 +112,8 @@ class CostTerm(Term):
             functions=residual.functions, exact_hessian=False,
         )  # fmt: skip
 
-    def scaled(self, factor: float) -> Self:
+    @checked
+    def scaled(self, factor: NonNegative) -> Self:
         """The term times a number, which is the last in its data: another number compiles nothing."""
         kernels = source_of(__name__, FACTOR=self.numbers)
         kernels = kernels.filled(stated=(self.code, "value"), stated_derivatives=(self.code, "derivatives"))

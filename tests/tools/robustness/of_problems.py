@@ -260,7 +260,7 @@ def problems(place: Place) -> dict[str, tuple[Any, ...]]:
         },
         **{
             f"{type(one).__name__}.scaled": ({"self": one, "factor": 2.0},)
-            for one in (ls.QuadraticCost([1.0, 1.0], about=[0.0, 1.0]), ls.ControlCost([1.0]), around)
+            for one in (ls.QuadraticCost([1.0, 1.0], about=[0.0, 1.0]), ls.ControlCost([1.0]), around, term)
         },
         "source_of": ({"module": "lqrsim.problem.quadratic_cost", "CONTROL": True},),
         "CostTerm": ({field.name: getattr(term, field.name) for field in dataclasses.fields(term)},),
