@@ -1,5 +1,7 @@
 """Distances to obstacles, against MuJoCo's own and against finite differences."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -10,7 +12,10 @@ from sampling import examples
 from scipy.spatial.transform import Rotation
 
 import lqrsim as ls
+from lqrsim.codegen.compiled_module import module_of
+from lqrsim.codegen.sources import source_of
 from lqrsim.errors import Array
+from lqrsim.kernels import distances as distance_kernels
 from lqrsim.kernels.declarations import ROW
 from lqrsim.kernels.distances import signed_distance_derivatives
 from lqrsim.problem import collision_shape
@@ -87,6 +92,22 @@ def test_derivatives_are_those_of_the_distance(kind: str) -> None:
             curve = (high - low) / (2 * step)
             if np.abs(curve).max() < 1e3:  # else the two points lie on different faces
                 np.testing.assert_allclose(hessian[axis], curve, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("unknown", [[0], [1], [2], [0, 2], [0, 1, 2]])
+def test_distance_of_a_point_that_is_not_a_number_is_none(kind: str, turned: bool, unknown: list[int]) -> None:
+    thing = obstacle(kind)
+    thing = thing if turned else replace(thing, rotation=np.eye(3))
+    world, point = ls.World([thing]), thing.position + 0.1
+    point[unknown] = np.nan
+    assert np.isnan(world.distance(point))
+    if kind != "mesh":
+        x, y, z = point.tolist()
+        for kernels in (distance_kernels, module_of(source_of(distance_kernels), "distances")):
+            given = world.table.ravel().copy(), 0, x, y, z, np.zeros(3), np.zeros((3, 3))
+            assert np.isnan(kernels.signed_distance_derivatives(*given))
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -135,7 +135,7 @@ def box_derivatives(data, row: int, dx: float, dy: float, dz: float, gradient, h
         local = data[row + 4 + k] * dx + data[row + 7 + k] * dy + data[row + 10 + k] * dz
         beyond[k] = abs(local) - data[row + 13 + k]
         sign[k] = 1.0 if local > 0 else -1.0
-        if beyond[k] > deepest:
+        if k == 0 or beyond[k] > deepest:  # a NaN stays
             deepest, face = beyond[k], k
     if not deepest > 0:
         axis = row + 4 + face
