@@ -16,7 +16,7 @@ from math import copysign, inf, isfinite, nan
 
 from lqrsim.kernels.declarations import CONVERGED, RUNNING, STALLED, M, N, inline
 from lqrsim.kernels.linear_algebra import copy, copy_matrix, fill
-from lqrsim.kernels.model_functions import evaluate_constraints
+from lqrsim.kernels.model_functions import cost_of_plan, evaluate_constraints
 from lqrsim.kernels.passes import larger
 from lqrsim.kernels.stages import (
     CONTROL,
@@ -24,7 +24,6 @@ from lqrsim.kernels.stages import (
     LIMIT,
     SIDE,
     closed_loop_rollout,
-    cost_of_plan,
     direction,
     plan_residuals,
     read_rows,
@@ -263,8 +262,8 @@ def roll_out(stages, work, mem):
                 i = int(rows.limits[row, CONTROL])
                 work.plan.controls[t, i] = rows.limits[row, SIDE]
                 fill(policy.gain[t, i], N, 0.0)
-    closed_loop_rollout(stages.steps, 0.0, work.plan, policy, work.limits, stages.model, work.out)
+    closed_loop_rollout(0.0, work.plan, stages, work.limits, work.out)
     evaluate_constraints(
         stages.steps, work.out.states, work.out.controls, stages.model.stage.constraints, stages.values
     )
-    mem.cost = cost_of_plan(stages, work.out)
+    mem.cost = cost_of_plan(stages.steps, work.out, stages.model)

@@ -367,7 +367,7 @@ def ilqr_iterations(first, stop, settings, model, work, memory, log):
         if NOISY:  # with the new policy's cost-to-go
             cost, _ = plan_cost(steps, plan, model, to_go)
         old = cost
-        cost, _, fraction = line_search(steps, no_shift, work, model, old, 0.0, SHORTEST, work.last)
+        cost, _, fraction = line_search(steps, no_shift, work, model, old, 0.0, SHORTEST)
         if fraction > 0:
             copy_plan(steps, work.last, plan)
         improvement = relative_improvement(old, cost, 0.0)
@@ -541,9 +541,9 @@ def follow_step(settings, model, work, memory):
     for i in range(N):
         shift[i] = work.x_hat[i] - work.best.states[0, i]
     if memory.reach == 0 and memory.second_order == 0 and how.patient:
-        return line_search(settings.steps, shift, work, model, bound, 0.0, SHORTEST, work.last)
+        return line_search(settings.steps, shift, work, model, bound, 0.0, SHORTEST)
     slope = how.armijo * memory.decrease
-    return line_search(settings.steps, shift, work, model, bound, slope, how.smallest, work.last)
+    return line_search(settings.steps, shift, work, model, bound, slope, how.smallest)
 
 
 def relax(how, memory, fraction):

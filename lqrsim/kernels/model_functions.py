@@ -4,7 +4,7 @@ Passes and iterations are therefore compiled once per size, and serve all proble
 `records.ProblemModel`.
 """
 
-from lqrsim.kernels.declarations import HESSIANS, STATES, N, W, call, call_for_value, compact, stack
+from lqrsim.kernels.declarations import HESSIANS, STATES, M, N, W, call, call_for_value, compact, stack, zeros
 from lqrsim.kernels.linear_algebra import clear, copy, copy_matrix, fill, step_offset
 from lqrsim.kernels.records import NextStep
 
@@ -91,6 +91,15 @@ def cost_value(x, u, t, cost):
     for k in range(cost.size):
         total += call_for_value(cost.functions[k, VALUE], x, u, t, cost.data[k])
     return total
+
+
+def cost_of_plan(steps, plan, model):
+    """The cost of a plan, without noise."""
+    none = zeros(M)
+    total = cost_value(plan.states[0], none, 0, model.initial)
+    for t in range(steps):
+        total += cost_value(plan.states[t], plan.controls[t], t, model.stage)
+    return total + cost_value(plan.states[steps], none, steps, model.final)
 
 
 def cost_added(x, u, t, cost):

@@ -24,6 +24,7 @@ from lqrsim.kernels.model_functions import (
     advance,
     cost_added,
     cost_of_order,
+    cost_of_plan,
     cost_quadratic,
     cost_value,
     linearize_forward,
@@ -274,14 +275,11 @@ def noise_cost(steps, plan, model, to_go):
 
 def plan_cost(steps, plan, model, to_go):
     """The cost of a trajectory with the expected cost of noise, and the augmented Lagrangian's terms."""
-    states, controls = plan.states, plan.controls
-    cost, added = cost_value(states[0], controls[0], 0, model.initial), 0.0
+    added = 0.0
     for t in range(steps):
-        cost += cost_value(states[t], controls[t], t, model.stage)
-        added += cost_added(states[t], controls[t], t, model.stage)
-    cost += cost_value(states[steps], controls[steps - 1], steps, model.final)
-    added += cost_added(states[steps], controls[steps - 1], steps, model.final)
-    return cost + noise_cost(steps, plan, model, to_go), added
+        added += cost_added(plan.states[t], plan.controls[t], t, model.stage)
+    added += cost_added(plan.states[steps], plan.controls[steps - 1], steps, model.final)
+    return cost_of_plan(steps, plan, model) + noise_cost(steps, plan, model, to_go), added
 
 
 def ddp_pass(steps, plan, model, order, keep, policy, to_go):
@@ -415,17 +413,17 @@ def larger(a, b):
     return b if b > a or isnan(b) else a
 
 
-def line_search(steps, shift, work, model, bound, slope, smallest, trial):
+def line_search(steps, shift, work, model, bound, slope, smallest):
     """Try fractions 1, 1/2, 1/4, ... of a step until the merit is below `bound` by that fraction of `slope`.
 
     The merit is the true cost (with noise the expected one) plus the augmented Lagrangian's terms. Returns merit, cost
     and fraction; or `bound`, `bound` and 0 if no fraction down to `smallest` is accepted.
 
     Args:
-      shift: (N,) shift of the start. work: its policy contains the changes of the controls, about its plan.
-      trial: Motion, written.
+      shift: (N,) shift of the start. work: its policy contains the changes of the controls, about its plan; the rollout
+        is written to its `last`.
     """
-    fraction, plan, policy = 1.0, work.best, work.policy
+    fraction, plan, policy, trial = 1.0, work.best, work.policy, work.last
     while fraction >= smallest:
         for i in range(N):
             trial.states[0, i] = plan.states[0, i] + fraction * shift[i]

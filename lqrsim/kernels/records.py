@@ -240,7 +240,6 @@ class PlanStages(NamedTuple):
     """A problem as stages about a plan: its numbers, its models and rows, and the last step."""
 
     steps: int  # T
-    soft: int  # 1 if there is an initial cost
     free: Annotated[Arrays, "N"]  # 0 for the states that the start fixes, else 1
     jumps: Annotated[Arrays, "T+1"]  # 1 where the last state is free, and may jump
     reset: Annotated[Arrays, "T+1 N+1"]  # the law of its change there

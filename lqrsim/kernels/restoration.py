@@ -73,7 +73,7 @@ def restoration(first, last, price, stages, work, memory, log):
             return done, RUNNING
         if not descend(price, stages, work, mem):
             return done, NOT_FINITE
-        ended = measure_violation(stages, work, mem)
+        ended = measure_violation(stages, mem)
         row = log[done]
         row.cost, row.violation, row.relative_decrease = mem.cost, mem.violation, mem.relative_decrease
         done += 1
@@ -98,7 +98,7 @@ def begin_restoration(price, stages, work, mem):
             fill(stages.policy.gain[t, i], N, 0.0)
     confine(stages, work)
     copy_plan(steps, work.plan, work.trial)
-    closed_loop_rollout(steps, 0.0, work.trial, stages.policy, work.limits, stages.model, work.plan)
+    closed_loop_rollout(0.0, work.trial, stages, work.limits, work.plan)
     mem.rows = 0.0
     for at in range(rows.size * (steps + 1)):
         rows.force[at] = 0.0
@@ -148,7 +148,7 @@ def descend(price, stages, work, mem):
     confine(stages, work)
     mem.fraction, fraction = 0.0, 1.0
     while fraction > SHORTEST and mem.fraction == 0:
-        closed_loop_rollout(steps, fraction, work.plan, stages.policy, work.limits, stages.model, work.trial)
+        closed_loop_rollout(fraction, work.plan, stages, work.limits, work.trial)
         if finite(work.trial.states, steps + 1, N):
             cost = evaluate_plan(stages, work.trial, work.arrived)
             read_rows(stages, work.trial, work.numbers)
@@ -240,7 +240,7 @@ def penalized(cost, numbers, price, stages, mem):
     return total if isfinite(total) else inf
 
 
-def measure_violation(stages, work, mem):
+def measure_violation(stages, mem):
     """Compute the violation of the plan before the step; return whether the descent ends."""
     rows, relative = stages.rows, 0.0
     mem.violation = 0.0

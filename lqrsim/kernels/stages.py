@@ -27,8 +27,8 @@ from lqrsim.kernels.model_functions import (
     advance_all,
     all_steps_second_order,
     cost_of_order,
+    cost_of_plan,
     cost_quadratic,
-    cost_value,
     evaluate_constraints,
     slope_of_constraint,
     step_second_order,
@@ -79,9 +79,7 @@ def write_models(known, stages, plan, costates, least):
         if not known and t > 0:
             lagrangian_slope(t, stages, costates[min(t + 1, stages.steps)], slope)
             copy(slope, N, costates[t])
-    if stages.soft == 1:
-        total += add_initial(plan.states[0], stages)
-    return total
+    return total + add_initial(plan.states[0], stages)
 
 
 def cost_model(t, stages, plan):
@@ -115,9 +113,8 @@ def project(stages, plan):
     for t in range(stages.steps):
         cost_quadratic(plan.states[t], plan.controls[t], t, model.stage, convex[t], gradient)
     cost_quadratic(plan.states[stages.steps], none, stages.steps, model.final, convex[stages.steps], gradient)
-    if stages.soft == 1:
-        cost_quadratic(plan.states[0], none, 0, model.initial, hessian, gradient)
-        add_matrix(hessian, N, convex[0])
+    cost_quadratic(plan.states[0], none, 0, model.initial, hessian, gradient)
+    add_matrix(hessian, N, convex[0])
     stages.projected[0] = 1.0
 
 
@@ -197,7 +194,7 @@ def evaluate_plan(stages, plan, arrived):
     advance_all(stages.steps, plan, stages.model, arrived)
     for t in range(stages.steps):
         cut_at_jump(t, stages, plan, arrived, stages.models.jacobian[t])
-    return cost_of_plan(stages, plan)
+    return cost_of_plan(stages.steps, plan, stages.model)
 
 
 def cut_at_jump(t, stages, plan, arrived, jacobian):
@@ -205,15 +202,6 @@ def cut_at_jump(t, stages, plan, arrived, jacobian):
     if stages.jumps[t + 1] != 0:
         arrived[t, N - 1] = plan.states[t + 1, N - 1]
         fill(jacobian[N - 1], W, 0.0)
-
-
-def cost_of_plan(stages, plan):
-    """The cost of a plan."""
-    none, steps, model = zeros(M), stages.steps, stages.model
-    total = cost_value(plan.states[0], none, 0, model.initial) if stages.soft == 1 else 0.0
-    for t in range(steps):
-        total += cost_value(plan.states[t], plan.controls[t], t, model.stage)
-    return total + cost_value(plan.states[steps], none, steps, model.final)
 
 
 def read_rows(stages, plan, numbers):
@@ -553,15 +541,16 @@ def start_change(free, to_go, change):
     return good
 
 
-def closed_loop_rollout(steps, fraction, plan, policy, limits, model, out):
-    """Roll out a fraction of a step from a trajectory, with its gains closing the loop.
+def closed_loop_rollout(fraction, plan, stages, limits, out):
+    """Roll out a fraction of the step that `direction` found, with its gains closing the loop.
 
     Args:
-      fraction: how much of it. plan: a Motion that satisfies the dynamics. policy: as `riccati_step` writes it.
-      limits: limits of the controls at each step, (T, M) each. out: Motion, written.
+      plan: a Motion that satisfies the dynamics. limits: limits of the controls at each step, (T, M) each.
+      out: Motion, written.
     """
+    policy, model = stages.policy, stages.model
     copy(plan.states[0], N, out.states[0])
-    for t in range(steps):
+    for t in range(stages.steps):
         for i in range(M):
             total = plan.controls[t, i] + fraction * policy.offset[t, i]
             for j in range(N):

@@ -91,7 +91,7 @@ class Stages:
         stage_rows = zeros_of(records.StageRows, {"size": rows}, **self._lengths)
         stage_rows.limits[...], stage_rows.first[...] = np.inf, np.cumsum([0, *counts])[:-1]
         values = tuple(np.zeros((steps + 1) * count) for count in counts)
-        stated = {"steps": steps, "soft": 0, "learns": 0, "model": None, "values": values, "rows": stage_rows}
+        stated = {"steps": steps, "learns": 0, "model": None, "values": values, "rows": stage_rows}
         self.about = zeros_of(records.PlanStages, stated, **self._lengths)
         self.about.state_size[...], self.about.control_size[...] = 1.0, 1.0
         self.models = self.about.models
@@ -125,9 +125,7 @@ class Stages:
             self.live[steps, self.owners == k] &= not constraint.term.uses_control
         self.live[steps, self.owners == -1] = False
         self._acts[...] = self._live[...] = self.live
-        self.about = self.about._replace(
-            steps=steps, soft=0 if fixed else 1, learns=int(problem.dynamics.by_mujoco), model=model
-        )
+        self.about = self.about._replace(steps=steps, learns=int(problem.dynamics.by_mujoco), model=model)
         self.about.uses_learned[...], self.about.reuses_derivatives[...] = 0.0, 0.0
         self.about.free[...], self.about.reach[...] = 0.0 if fixed else 1.0, 0.0
         self.about.jumps[...] = 0.0
