@@ -80,15 +80,6 @@ def plot_errors(curves: Curves, path: Path, label: str) -> Path:
     return plot_curves(curves, path, label, yscale="log")
 
 
-def _without_opengl() -> str:
-    """The reason why this machine cannot draw pictures; empty if it can."""
-    try:
-        gl.bind()
-    except InputError as error:
-        return str(error)
-    return ""
-
-
 def _video(results: Results, trial: analysis.Trial, problem: str, folder: Path) -> dict[str, Any]:
     """The video of a trial as text, unless there is a problem, with its label and the command that repeats it."""
     command = results.command_of("replay", "--cell", str(trial.cell), "--trial", str(trial.trial))
@@ -153,7 +144,7 @@ def report(
         tell(2, parts)
         worst_of_each = (next((trial for trial in trials if trial.outcome != "error"), None) for trials in worst)
         shown = [trial for trial in worst_of_each if trial is not None][:videos]
-        problem, page["videos"] = _without_opengl() if shown else "", []
+        problem, page["videos"] = gl.missing() if shown else "", []
         if problem:
             page["videos_note"] = f"There are none, for this machine cannot draw pictures: {problem}"
         elif shown:

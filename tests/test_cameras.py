@@ -20,7 +20,7 @@ from lqrsim.view.picture import Pane
 from lqrsim.view.recorded_trial import RecordedTrial, drawn_size
 from lqrsim.view.render import VideoMetadata, digest, encoder, read_metadata
 
-draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
+draws = pytest.mark.skipif(bool(gl.missing()), reason=f"no OpenGL here: {gl.INSTALL}")
 TILTED = Camera("tilted", (3.0, -4.0, 5.0), (0.0, 0.6, -0.8), (0.0, 0.8, 0.6), 4.0)
 
 

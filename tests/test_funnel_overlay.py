@@ -18,7 +18,7 @@ from lqrsim.view.overlays import INTERPOLATED, DrawnTube, Overlays, Scale, colou
 from lqrsim.view.picture import open_picture
 from lqrsim.view.recorded_trial import RecordedTrial
 
-draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
+draws = pytest.mark.skipif(bool(gl.missing()), reason=f"no OpenGL here: {gl.INSTALL}")
 SMALL = (320, 180)
 
 

@@ -47,10 +47,10 @@ def case(request: pytest.FixtureRequest) -> tuple[str, ls.Scenario, ls.Solution]
 
 def test_gymnasiums_own_check_finds_nothing(case: tuple[str, ls.Scenario, ls.Solution]) -> None:
     name, _, solution = case
-    env = gymnasium.make(name, solution=solution, render_mode="rgb_array" if gl.available() else None)
+    env = gymnasium.make(name, solution=solution, render_mode="rgb_array" if not gl.missing() else None)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(env.unwrapped, skip_render_check=not gl.available())
+        check_env(env.unwrapped, skip_render_check=bool(gl.missing()))
     env.close()
 
 
@@ -275,7 +275,7 @@ def test_controls_without_limits_are_refused(tmp_path: Path) -> None:
         lqrsim.gym.Environment(str(path))
 
 
-@pytest.mark.skipif(not gl.available(), reason="needs OpenGL")
+@pytest.mark.skipif(bool(gl.missing()), reason="needs OpenGL")
 def test_pictures_are_those_of_still(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution, tmp_path: Path) -> None:
     rollout = ls.simulate(quadrotor.plant(), quadrotor_solution)
     env: Any = lqrsim.gym.make_env(
@@ -297,7 +297,7 @@ def test_pictures_are_those_of_still(quadrotor: ls.Scenario, quadrotor_solution:
         np.testing.assert_array_equal(picture, np.asarray(Image.open(path)))
 
 
-@pytest.mark.skipif(not gl.available(), reason="needs OpenGL")
+@pytest.mark.skipif(bool(gl.missing()), reason="needs OpenGL")
 def test_pictures_have_the_obstacles_of_their_episode(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
     """Each episode has its obstacles elsewhere, or none of them has; a picture does not depend on those before."""
 

@@ -26,7 +26,7 @@ from lqrsim.simulation.disturbances import Effect
 from lqrsim.view import cameras, gl, plots, viewer
 from lqrsim.view.viewer import Viewer
 
-draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
+draws = pytest.mark.skipif(bool(gl.missing()), reason=f"no OpenGL here: {gl.INSTALL}")
 SIDES = '<geom name="beside" type="plane" size="1 1 1" pos="0 0.9 0" zaxis="0 -1 0"/>'
 FLOOR = '<geom name="floor" type="plane" size="4 4 1" pos="0 0 -1.2"/>'
 

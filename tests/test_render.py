@@ -25,7 +25,7 @@ from lqrsim.view.picture import Legend, open_picture
 from lqrsim.view.recorded_trial import RecordedTrial
 from lqrsim.view.render import digest, read_metadata, render
 
-draws = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
+draws = pytest.mark.skipif(bool(gl.missing()), reason=f"no OpenGL here: {gl.INSTALL}")
 SMALL = (320, 180)
 
 
@@ -644,7 +644,7 @@ def test_without_opengl_the_message_says_what_to_do(
     monkeypatch.setenv("MUJOCO_GL", choice)
     gl.bind.cache_clear()
     try:
-        assert not gl.available()
+        assert gl.missing()
         with pytest.raises(ls.InputError, match=r"apt-get install -y libegl1|want it unset"):
             render(drive, tmp_path / "run.mp4")
     finally:

@@ -26,7 +26,7 @@ from lqrsim.view.render import VideoMetadata, digest, read_metadata
 
 faults: Any = importlib.import_module("injected_faults")  # of experiments/, whose benchmark makes them at full size
 
-pytestmark = pytest.mark.skipif(not gl.available(), reason=f"no OpenGL here: {gl.INSTALL}")
+pytestmark = pytest.mark.skipif(bool(gl.missing()), reason=f"no OpenGL here: {gl.INSTALL}")
 
 ROBOTS = ("quadrotor", "differential_drive")
 # Metres; the first as the packaged robots are verified, rms and at worst, the second of videos.

@@ -31,10 +31,8 @@ def figure(config: FolderSettings, result: Result, name: str, size: tuple[float,
 
 def render_still(config: FolderSettings, result: Result, name: str, rollout: ls.Rollout, **options: Any) -> None:
     """A picture by `lqrsim.render`, noted in the result; without OpenGL, why there is none."""
-    try:
-        gl.bind()
-    except ls.InputError as error:
-        result.setdefault("not drawn", {})[name] = str(error)
+    if reason := gl.missing():
+        result.setdefault("not drawn", {})[name] = reason
         return
     size = (320, 180) if config.quick else (1280, 720)
     ls.render(rollout, config.out / FIGURES / f"{name}.png", size=size, **options)

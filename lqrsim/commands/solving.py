@@ -486,12 +486,9 @@ class Demo:
 
         console.check_output("--out", self.out)
         scenarios, video = {reference: resolve(reference) for reference in self.robots}, self.video
-        if video:
-            try:
-                gl.bind()
-            except ls.InputError as error:
-                console.say(f"No videos, everything else works: {error}")
-                video = False
+        if video and (reason := gl.missing()):
+            console.say(f"No videos, everything else works: {reason}")
+            video = False
         folders = dict[Path, str]()
         for reference, scenario in scenarios.items():
             if (other := folders.setdefault(self.out / folder_name(scenario), reference)) != reference:

@@ -48,10 +48,10 @@ def bind() -> None:
         raise InputError(f"OpenGL: got {backend}, which fails ({reason}), want {want}: {INSTALL}") from error
 
 
-def available() -> bool:
-    """Whether pictures can be drawn here; if not, `bind` raises the reason."""
+def missing() -> str:
+    """Why no pictures can be drawn here, as `bind` raises it; empty if they can."""
     try:
         bind()
-    except InputError:
-        return False
-    return True
+    except InputError as error:
+        return str(error)
+    return ""
