@@ -408,7 +408,7 @@ def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str =
     but = DRIVERS if form == "primal" or sizes["NOISY"] else ()
     if task == "opening":
         model = work.model
-        replay(source, sizes, "opening_pass", one.steps, False, work.arrays.given, work.prior, model,
+        replay(source, sizes, "opening_pass", one.steps, False, work.arrays.guess, work.prior, model,
                work.arrays.policy, work.arrays.to_go)  # fmt: skip
         return
     for done in range(len(log)):
@@ -679,8 +679,8 @@ class TestRareEnds:
         one = Begun(problem(), start=start)
         arrays = one.work.arrays
         for spoil in (1.0, np.nan):
-            arrays.given.states[3] *= spoil
-            found = replay(one.source, one.sizes, "opening_pass", 6, True, arrays.given, one.work.prior,
+            arrays.guess.states[3] *= spoil
+            found = replay(one.source, one.sizes, "opening_pass", 6, True, arrays.guess, one.work.prior,
                            one.work.model, arrays.policy, arrays.to_go)  # fmt: skip
             assert found[0] == (-1 if spoil == 1 else 3)
 

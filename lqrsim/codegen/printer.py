@@ -880,19 +880,19 @@ class _Body:
                 return self._call_word(meaning.name, values, node)
         self._refuse(node, f"a call of {name}", "a kernel, a record or a word of `codegen/language.py`")
 
-    def _call_kernel(self, function: ScopedFunction, given: list[Value], node: ast.Call) -> Value | None:
+    def _call_kernel(self, function: ScopedFunction, arguments: list[Value], node: ast.Call) -> Value | None:
         count = len(function.node.args.args)
-        if len(given) != count:
-            self._refuse(node, f"{len(given)} arguments for {function.node.name}", str(count))
-        symbol, result = self.program.instance(function, tuple(value.type for value in given))
+        if len(arguments) != count:
+            self._refuse(node, f"{len(arguments)} arguments for {function.node.name}", str(count))
+        symbol, result = self.program.instance(function, tuple(value.type for value in arguments))
         if _by_address(function):
-            given = [self._in_memory(value) if isinstance(value.type, Group) else value for value in given]
-        parts = [part for value in given for part in ([value] if _is_address(value) else _leaves(value))]
-        arguments = ", ".join(f"{_passed_type(part.type)} {part.name}" for part in parts)
+            arguments = [self._in_memory(value) if isinstance(value.type, Group) else value for value in arguments]
+        parts = [part for value in arguments for part in ([value] if _is_address(value) else _leaves(value))]
+        passed = ", ".join(f"{_passed_type(part.type)} {part.name}" for part in parts)
         if result is None:
-            self._do(f"call void {symbol}({arguments})")
+            self._do(f"call void {symbol}({passed})")
             return None
-        returned = self._emit(f"call {llvm_type(result)} {symbol}({arguments})")
+        returned = self._emit(f"call {llvm_type(result)} {symbol}({passed})")
         if not isinstance(result, Group):
             return Value(result, returned)
         extract = f"extractvalue {llvm_type(result)} {returned}"
@@ -908,31 +908,31 @@ class _Body:
             self._do(f"store {llvm_type(part.type)} {part.name}, ptr {self._at('i64', table, i)}")
         return Value(value.type, table)
 
-    def _call_word(self, name: str, given: list[Value], node: ast.Call) -> Value | None:
+    def _call_word(self, name: str, arguments: list[Value], node: ast.Call) -> Value | None:
         method, count = getattr(self, f"_word_{name}", None), _COUNTS.get(name, 2 if name in BINARY else 1)
-        if name in _MANY and len(given) < count:
-            self._refuse(node, f"{len(given)} arguments in `{ast.unparse(node)}`", f"{count} or more")
-        if name not in _MANY and len(given) != count:
-            self._refuse(node, f"{len(given)} arguments in `{ast.unparse(node)}`", str(count))
+        if name in _MANY and len(arguments) < count:
+            self._refuse(node, f"{len(arguments)} arguments in `{ast.unparse(node)}`", f"{count} or more")
+        if name not in _MANY and len(arguments) != count:
+            self._refuse(node, f"{len(arguments)} arguments in `{ast.unparse(node)}`", str(count))
         if method is not None:
-            return method(given, node)
+            return method(arguments, node)
         if name in UNARY or name in BINARY:
             library = UNARY.get(name) or BINARY[name]
             fast = f" {self._fast}" if library.startswith("llvm.") and name not in ("copysign", "pow") else ""
-            return self._library(library, *(self._float(value, node) for value in given), fast=fast)
+            return self._library(library, *(self._float(value, node) for value in arguments), fast=fast)
         if name in SCALES:
-            return self._arithmetic(ast.Mult(), given[0], _constant(float(SCALES[name])), node)
+            return self._arithmetic(ast.Mult(), arguments[0], _constant(float(SCALES[name])), node)
         if name in TESTS:
-            number = self._float(given[0], node)
+            number = self._float(arguments[0], node)
             if name == "isnan":
                 return Value(BOOL, self._emit(f"fcmp uno double {number}, {number}"))
             size, test = self._library("llvm.fabs.f64", number), "oeq" if name == "isinf" else "olt"
             return Value(BOOL, self._emit(f"fcmp {test} double {size.name}, {_hex(math.inf)}"))
         self._refuse(node, f"a call of {name}", "a word of `codegen/language.py`")
 
-    def _extreme(self, given: list[Value], node: ast.AST, op: ast.cmpop, plainly: Callable[..., Any]) -> Value:
-        total = given[0]
-        for other in given[1:]:
+    def _extreme(self, arguments: list[Value], node: ast.AST, op: ast.cmpop, plainly: Callable[..., Any]) -> Value:
+        total = arguments[0]
+        for other in arguments[1:]:
             if _is_number(total.constant) and _is_number(other.constant):
                 total = _constant(plainly(total.constant, other.constant))
                 continue
@@ -948,39 +948,39 @@ class _Body:
     _word_min = functools.partialmethod(_extreme, op=ast.Lt(), plainly=min)
     _word_max = functools.partialmethod(_extreme, op=ast.Gt(), plainly=max)
 
-    def _word_abs(self, given: list[Value], node: ast.AST) -> Value:
-        if given[0].type in (INT, BOOL):
-            number = self._int(given[0], node)
+    def _word_abs(self, arguments: list[Value], node: ast.AST) -> Value:
+        if arguments[0].type in (INT, BOOL):
+            number = self._int(arguments[0], node)
             negative = self._emit(f"icmp slt i64 {number}, 0")
             minus = self._emit(f"sub nsw i64 0, {number}")
             return Value(INT, self._emit(f"select i1 {negative}, i64 {minus}, i64 {number}"))
-        return self._library("llvm.fabs.f64", self._float(given[0], node))
+        return self._library("llvm.fabs.f64", self._float(arguments[0], node))
 
-    def _word_int(self, given: list[Value], node: ast.AST) -> Value:
-        if given[0].type is FLOAT:
-            return Value(INT, self._emit(f"fptosi double {given[0].name} to i64"))
-        return Value(INT, self._int(given[0], node))
+    def _word_int(self, arguments: list[Value], node: ast.AST) -> Value:
+        if arguments[0].type is FLOAT:
+            return Value(INT, self._emit(f"fptosi double {arguments[0].name} to i64"))
+        return Value(INT, self._int(arguments[0], node))
 
-    def _word_float(self, given: list[Value], node: ast.AST) -> Value:
-        return Value(FLOAT, self._float(given[0], node))
+    def _word_float(self, arguments: list[Value], node: ast.AST) -> Value:
+        return Value(FLOAT, self._float(arguments[0], node))
 
-    def _word_len(self, given: list[Value], node: ast.AST) -> Value:
-        if not isinstance(given[0].type, Group):
-            self._refuse(node, f"the length of {describe(given[0].type)}", "that of a tuple")
-        return _constant(len(given[0].parts))
+    def _word_len(self, arguments: list[Value], node: ast.AST) -> Value:
+        if not isinstance(arguments[0].type, Group):
+            self._refuse(node, f"the length of {describe(arguments[0].type)}", "that of a tuple")
+        return _constant(len(arguments[0].parts))
 
-    def _word_stack(self, given: list[Value], node: ast.AST) -> Value:
-        shape = [size.constant for size in given if isinstance(size.constant, int) and size.constant >= 0]
-        if not shape or len(shape) < len(given):
+    def _word_stack(self, arguments: list[Value], node: ast.AST) -> Value:
+        shape = [size.constant for size in arguments if isinstance(size.constant, int) and size.constant >= 0]
+        if not shape or len(shape) < len(arguments):
             self._refuse(node, f"`{ast.unparse(node)}`", "constant sizes")
         total = math.prod(shape)
         if total > MOST_ON_STACK:
             self._refuse(node, f"`{ast.unparse(node)}`", f"at most {MOST_ON_STACK} numbers")
         return Value(Pointer(tuple(shape[1:])), self._slot(f"[{max(total, 1)} x double]", 64))
 
-    def _word_zeros(self, given: list[Value], node: ast.Call) -> Value:
-        value = self._word_stack(given, node)
-        size = 8 * math.prod(size.constant for size in given)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    def _word_zeros(self, arguments: list[Value], node: ast.Call) -> Value:
+        value = self._word_stack(arguments, node)
+        size = 8 * math.prod(size.constant for size in arguments)  # pyright: ignore[reportArgumentType, reportCallIssue]
         memset = self.program.declare("llvm.memset.p0.i64", "void", "ptr, i8, i64, i1")
         self._do(f"call void {memset}(ptr align 64 {value.name}, i8 0, i64 {size}, i1 false)")
         return value
@@ -993,54 +993,54 @@ class _Body:
             number = self._emit(f"fptosi double {number} to i64")
         return self._emit(f"inttoptr i64 {number} to ptr")
 
-    def _word_at(self, given: list[Value], node: ast.AST) -> Value:
-        return Value(VECTOR, self._pointer(given[0], node))
+    def _word_at(self, arguments: list[Value], node: ast.AST) -> Value:
+        return Value(VECTOR, self._pointer(arguments[0], node))
 
-    def _word_rows_at(self, given: list[Value], node: ast.AST) -> Value:
-        if not isinstance(given[1].constant, int) or given[1].constant < 1:
+    def _word_rows_at(self, arguments: list[Value], node: ast.AST) -> Value:
+        if not isinstance(arguments[1].constant, int) or arguments[1].constant < 1:
             self._refuse(node, "a width that is not constant", "a constant one, of at least 1")
-        return Value(Pointer((given[1].constant,)), self._pointer(given[0], node))
+        return Value(Pointer((arguments[1].constant,)), self._pointer(arguments[0], node))
 
-    def _word_int32(self, given: list[Value], node: ast.AST) -> Value:
-        return Value(INT32, self._emit(f"trunc i64 {self._int(given[0], node)} to i32"))
+    def _word_int32(self, arguments: list[Value], node: ast.AST) -> Value:
+        return Value(INT32, self._emit(f"trunc i64 {self._int(arguments[0], node)} to i32"))
 
-    def _word_power_of_two(self, given: list[Value], node: ast.AST) -> Value:
+    def _word_power_of_two(self, arguments: list[Value], node: ast.AST) -> Value:
         # Added to 1.5 2^52, the exponent is in the lowest bits of the sum; shifted by 52 bits, it is in its place.
-        biased = self._emit(f"fadd double {self._float(given[0], node)}, {_hex(1.5 * 2.0**52 + 1023)}")
+        biased = self._emit(f"fadd double {self._float(arguments[0], node)}, {_hex(1.5 * 2.0**52 + 1023)}")
         bits = self._emit(f"shl i64 {self._emit(f'bitcast double {biased} to i64')}, 52")
         return Value(FLOAT, self._emit(f"bitcast i64 {bits} to double"))
 
-    def _c_call(self, kind: str, given: list[Value], node: ast.AST) -> str:
-        function = self._pointer(given[0], node)
-        parts = [part for value in given[1:] for part in _leaves(value)]
+    def _c_call(self, kind: str, arguments: list[Value], node: ast.AST) -> str:
+        function = self._pointer(arguments[0], node)
+        parts = [part for value in arguments[1:] for part in _leaves(value)]
         parts = [self._cast(part, INT, node) if part.type is BOOL else part for part in parts]
         return f"call {kind} {function}({', '.join(f'{llvm_type(part.type)} {part.name}' for part in parts)})"
 
-    def _word_call(self, given: list[Value], node: ast.AST) -> None:
-        self._do(self._c_call("void", given, node))
+    def _word_call(self, arguments: list[Value], node: ast.AST) -> None:
+        self._do(self._c_call("void", arguments, node))
 
-    def _word_call_for_value(self, given: list[Value], node: ast.AST) -> Value:
-        return Value(FLOAT, self._emit(self._c_call("double", given, node)))
+    def _word_call_for_value(self, arguments: list[Value], node: ast.AST) -> Value:
+        return Value(FLOAT, self._emit(self._c_call("double", arguments, node)))
 
-    def _shared(self, given: list[Value], node: ast.AST) -> str:
+    def _shared(self, arguments: list[Value], node: ast.AST) -> str:
         """The address of an int64 that threads share."""
-        return self._at("i64", self._pointer(given[0], node), self._int(given[1], node))
+        return self._at("i64", self._pointer(arguments[0], node), self._int(arguments[1], node))
 
-    def _word_claim(self, given: list[Value], node: ast.AST) -> Value:
-        outcome = self._emit(f"cmpxchg ptr {self._shared(given, node)}, i64 0, i64 1 acq_rel acquire")
+    def _word_claim(self, arguments: list[Value], node: ast.AST) -> Value:
+        outcome = self._emit(f"cmpxchg ptr {self._shared(arguments, node)}, i64 0, i64 1 acq_rel acquire")
         won = self._emit(f"extractvalue {{i64, i1}} {outcome}, 1")
         return Value(INT, self._emit(f"zext i1 {won} to i64"))
 
-    def _word_load(self, given: list[Value], node: ast.AST) -> Value:
-        return Value(INT, self._emit(f"load atomic i64, ptr {self._shared(given, node)} acquire, align 8"))
+    def _word_load(self, arguments: list[Value], node: ast.AST) -> Value:
+        return Value(INT, self._emit(f"load atomic i64, ptr {self._shared(arguments, node)} acquire, align 8"))
 
-    def _word_store(self, given: list[Value], node: ast.AST) -> None:
-        number = self._int(given[2], node)
-        self._do(f"store atomic i64 {number}, ptr {self._shared(given, node)} release, align 8")
+    def _word_store(self, arguments: list[Value], node: ast.AST) -> None:
+        number = self._int(arguments[2], node)
+        self._do(f"store atomic i64 {number}, ptr {self._shared(arguments, node)} release, align 8")
 
-    def _word_fetch_add(self, given: list[Value], node: ast.AST) -> Value:
-        number = self._int(given[2], node)
-        return Value(INT, self._emit(f"atomicrmw add ptr {self._shared(given, node)}, i64 {number} acq_rel"))
+    def _word_fetch_add(self, arguments: list[Value], node: ast.AST) -> Value:
+        number = self._int(arguments[2], node)
+        return Value(INT, self._emit(f"atomicrmw add ptr {self._shared(arguments, node)}, i64 {number} acq_rel"))
 
 
 def _hex(number: float) -> str:

@@ -158,9 +158,9 @@ class ScopedFunction:
     @property
     def decorators(self) -> set[str]:
         """The names of the decorators; without any, in a file of kernels that is COMPACT, `compact`."""
-        own = {decorator.id for decorator in self.node.decorator_list if isinstance(decorator, ast.Name)}
-        compact = not own and _is_kernels(self.scope.source.module) and self.scope.find("COMPACT")
-        return {"compact"} if compact else own
+        stated = {decorator.id for decorator in self.node.decorator_list if isinstance(decorator, ast.Name)}
+        compact = not stated and _is_kernels(self.scope.source.module) and self.scope.find("COMPACT")
+        return {"compact"} if compact else stated
 
 
 @dataclass(frozen=True)

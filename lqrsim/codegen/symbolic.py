@@ -179,11 +179,11 @@ def _unsorted_extremes() -> Iterator[None]:
     """A context in which `Max` and `Min` keep their arguments: SymPy compares all pairs, for seconds."""
     from sympy.functions.elementary.miscellaneous import MinMaxBase
 
-    def keep(cls: Any, *given: Any, **options: Any) -> Any:
-        if any(getattr(argument, "free_symbols", ()) for argument in given):
+    def keep(cls: Any, *arguments: Any, **options: Any) -> Any:
+        if any(getattr(argument, "free_symbols", ()) for argument in arguments):
             options = {"evaluate": False} | options
-            given = tuple(argument for argument in given if argument != cls.identity)
-        return original(cls, *given, **options)
+            arguments = tuple(argument for argument in arguments if argument != cls.identity)
+        return original(cls, *arguments, **options)
 
     with _TRACING:
         original = MinMaxBase.__new__

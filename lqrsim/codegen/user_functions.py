@@ -381,14 +381,14 @@ class Jitted:
         """Without what is compiled, which cannot be pickled."""
         return {name: value for name, value in vars(self).items() if name != "_jitted"}
 
-    def __call__(self, *given: Any) -> Any:
+    def __call__(self, *arguments: Any) -> Any:
         with in_double_precision():
-            return np.asarray(self._jitted(*given))
+            return np.asarray(self._jitted(*arguments))
 
-    def traced(self, *given: Any) -> Any:
+    def traced(self, *arguments: Any) -> Any:
         import jax.numpy as jnp
 
-        return jnp.asarray(self.py_func(*given))
+        return jnp.asarray(self.py_func(*arguments))
 
     @cached_property
     def _jitted(self) -> Callable[..., Any]:
@@ -408,17 +408,17 @@ class JittedDerivatives(Jitted):
         super().__init__(function)
         self.shapes = shapes
 
-    def __call__(self, *given: Any) -> Any:
+    def __call__(self, *arguments: Any) -> Any:
         count = len(self.shapes)
         with in_double_precision():
-            for array, values in zip(given[-count:], self._jitted(*given[:-count]), strict=True):
+            for array, values in zip(arguments[-count:], self._jitted(*arguments[:-count]), strict=True):
                 array[...] = values
 
-    def traced(self, *given: Any) -> tuple[Any, ...]:
+    def traced(self, *arguments: Any) -> tuple[Any, ...]:
         import jax
         import jax.numpy as jnp
 
-        *parts, p = given
+        *parts, p = arguments
         ends = np.cumsum([len(part) for part in parts])[:-1]
 
         def joined(z: Any) -> Any:

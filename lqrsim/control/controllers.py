@@ -51,7 +51,7 @@ def turn_to_nearest(space: Coordinates, states: Array, nominal: Array) -> None:
 
 
 def _laws(n: int, m: int) -> CompiledModule:
-    return module_of(source_of(feedback), f"policies of {n} states and {m} controls", N=n, M=m, W=n + m)
+    return module_of(source_of(feedback), f"policies of {n} states and {m} controls", N=n, M=m)
 
 
 def turning_of(space: Coordinates) -> AngularStates:

@@ -158,9 +158,7 @@ class PlanDerivatives:
     def compiled(self) -> CompiledModule:
         """`kernels/feedback.py`, for the functions of the plan's knots alone."""
         source = source_of(feedback, Y=self.sensor.size, NUMBERS=len(self.model.parameters))
-        return module_of(
-            source, f"a plan of {self.n} states and {self.m} controls", N=self.n, M=self.m, W=self.n + self.m
-        )
+        return module_of(source, f"a plan of {self.n} states and {self.m} controls", N=self.n, M=self.m)
 
     @cached_property
     def model(self) -> DynamicsModel:
@@ -169,7 +167,7 @@ class PlanDerivatives:
 
     @cached_property
     def compiled_sensor(self) -> SensorModel:
-        module = module_of(self.sensor.source, "sensors", N=self.n, M=self.m, W=self.n + self.m)
+        module = module_of(self.sensor.source, "sensors", N=self.n, M=self.m)
         measure, slope = module.addresses("measure", "measure_slope")
         return SensorModel(measure, slope, self.sensor.data)
 
@@ -301,7 +299,7 @@ class PlanModel:
             PADDED_D=max(len(self.transition), 1),
         )  # fmt: skip
         label = f"a filter of {self.size} numbers ({self.n} states, {self.m} controls)"
-        return module_of(source, label, N=self.n, M=self.m, W=self.n + self.m)
+        return module_of(source, label, N=self.n, M=self.m)
 
     @cached_property
     def predictor(self) -> Predictor:

@@ -102,7 +102,7 @@ def constraint_values(x, u, t, acts, data, multipliers, values):
         shared_values(x, data, shared)
     for row in range(rows):
         values[rows * t + row] = 0.0 if EQUALITY else inf
-        if acts and t >= multipliers[FIRST]:
+        if acts:
             values[rows * t + row] = constraint_value(shared if SHARED else x, u, t, row, data)
 
 

@@ -177,7 +177,7 @@ def predicted_decrease(step, stage, gain, S, change_limits, sizes, largest, cost
       curvature; and the largest curvature.
     """
     jacobian, hessian, gradient = step.jacobian, stage.hessian, stage.gradient
-    slope, curve, factor, moved, before = stack(M), stack(M, N), stack(M, M), stack(M), stack(N)
+    slope, curve, factor, best, before = stack(M), stack(M, N), stack(M, M), stack(M), stack(N)
     for i in range(M):
         slope[i] = gradient[N + i]
         for j in range(N):
@@ -200,15 +200,15 @@ def predicted_decrease(step, stage, gain, S, change_limits, sizes, largest, cost
             for j in range(N):
                 before[j] += gain[i, j] * slope[i]
     copy(before, N, costate)
-    own = 0.0
+    curvature = 0.0
     for i in range(M):
-        own = larger(own, 0.5 * factor[i, i] * sizes[N + i] * sizes[N + i])
-    largest = larger(largest, own)
-    if own > OF_PLAN * largest:
-        if not is_curved(factor, sizes, OF_BLOCK * own):
+        curvature = larger(curvature, 0.5 * factor[i, i] * sizes[N + i] * sizes[N + i])
+    largest = larger(largest, curvature)
+    if curvature > OF_PLAN * largest:
+        if not is_curved(factor, sizes, OF_BLOCK * curvature):
             for i in range(M):
-                factor[i, i] += 2 * OF_BLOCK * own / (sizes[N + i] * sizes[N + i])
-        return box_decrease(factor, slope, change_limits.low, change_limits.high, moved), 0.0, largest
+                factor[i, i] += 2 * OF_BLOCK * curvature / (sizes[N + i] * sizes[N + i])
+        return box_decrease(factor, slope, change_limits.low, change_limits.high, best), 0.0, largest
     squares = 0.0
     for i in range(M):
         size = min(sizes[N + i], -change_limits.low[i] if slope[i] > 0 else change_limits.high[i])
@@ -295,15 +295,15 @@ def box_decrease(matrix, slope, lowest, highest, best):
     if not inside:  # coordinate descent, until no entry moves
         fill(best, M, 0.0)
         for _ in range(1000):
-            moved, size = 0.0, 0.0
+            change, size = 0.0, 0.0
             for i in range(M):
                 left = slope[i]
                 for j in range(M):
                     left += matrix[i, j] * best[j]
                 new = min(max(best[i] - left / matrix[i, i], lowest[i]), highest[i])
-                moved, size = max(moved, abs(new - best[i])), max(size, abs(new))
+                change, size = max(change, abs(new - best[i])), max(size, abs(new))
                 best[i] = new
-            if not moved > 1e-12 * size:
+            if not change > 1e-12 * size:
                 break
     decrease = 0.0
     for i in range(M):

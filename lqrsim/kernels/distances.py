@@ -575,9 +575,9 @@ def hull_distances(obstacles, count, per_displacement, data, parts, hull_count, 
     for i in range(count):
         for part in range(hull_count):
             for k in range(obstacles):
-                at, moved = (i * hull_count + part) * obstacles + k, obstacles * (i // per_displacement) + k
+                at, shift = (i * hull_count + part) * obstacles + k, obstacles * (i // per_displacement) + k
                 first, end = int(parts[part]), int(parts[part + 1])
-                out[at] = hull_distance_displaced(data, ROW * k, corners[i], first, end, displaced[moved], slopes[at])
+                out[at] = hull_distance_displaced(data, ROW * k, corners[i], first, end, displaced[shift], slopes[at])
 
 
 @outline

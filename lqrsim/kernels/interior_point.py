@@ -954,7 +954,7 @@ def learn(stages, costates, last_step, turns, slow):
     models, slope, lacks = stages.models, stack(W), stack(W)
     for t in range(stages.steps + 1):
         lagrangian_slope(t, stages, costates[min(t + 1, stages.steps)], slope)
-        along, moved, wide = 0.0, 0.0, 0.0
+        along, square, wide = 0.0, 0.0, 0.0
         for i in range(W):
             lacks[i] = slope[i] - turns[t, i]
             for j in range(W):
@@ -963,9 +963,9 @@ def learn(stages, costates, last_step, turns, slow):
                     known += models.learned[t, i, j]
                 lacks[i] -= known * last_step[t, j]
             along += lacks[i] * last_step[t, i]
-            moved += last_step[t, i] * last_step[t, i]
+            square += last_step[t, i] * last_step[t, i]
             wide += lacks[i] * lacks[i]
-        if along * along > UNLEARNED * UNLEARNED * moved * wide:
+        if along * along > UNLEARNED * UNLEARNED * square * wide:
             for i in range(W):
                 for j in range(W):
                     change = lacks[i] * lacks[j] / along

@@ -185,13 +185,13 @@ def smoother_iterations(first, stop, settings, model, work, memory, log):
         roll_out_and_keep(steps, work.start, model, work, memory)
         copy(work.start, N, x_hat)
         if settings.guided and not fixed:
-            copy(work.given.states[0], N, x_hat)
+            copy(work.guess.states[0], N, x_hat)
     for done in range(first, stop):
         if fixed:  # whatever ran before, each pass begins at the given start
             copy(work.start, N, x_hat)
         weight = work.prior.weight if done < settings.prior_iterations else no_weight
         guided = settings.guided and done == 0
-        about = Linearization(work.given, guided, 1.0, 0.0, Prior(weight, work.prior.about))
+        about = Linearization(work.guess, guided, 1.0, 0.0, Prior(weight, work.prior.about))
         failed, good = forward_pass(settings, scaled, about, work)
         if failed >= 0:
             return done, failure(good, model), False, failed

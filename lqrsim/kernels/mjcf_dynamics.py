@@ -159,14 +159,14 @@ def curved(z, p, side, addresses, accelerations, arrived, columns):
 
     A change of everything at once, to the other side, then leads elsewhere than the columns say.
     """
-    moved, reached, off, largest = stack(W), stack(N), 0.0, 0.0
+    perturbed, reached, off, largest = stack(W), stack(N), 0.0, 0.0
     for j in range(W):
-        moved[j] = z[j] - side * WIDTH * max(1.0, abs(z[j]))
-    step_from(moved, z, p, addresses, accelerations, 0, reached)
+        perturbed[j] = z[j] - side * WIDTH * max(1.0, abs(z[j]))
+    step_from(perturbed, z, p, addresses, accelerations, 0, reached)
     for i in range(N):
         expected = arrived[i]
         for j in range(W):
-            expected += columns[i, j] * (moved[j] - z[j])
+            expected += columns[i, j] * (perturbed[j] - z[j])
             largest = max(largest, abs(columns[i, j]))
         off = max(off, abs(reached[i] - expected))
     return off > 2 * CURVED * WIDTH * largest  # twice, as the errors of both sides add up
@@ -275,13 +275,13 @@ def column(k, z, p, side, addresses, accelerations, arrived, jacobian):
     step: what comes before that stage is kept. MuJoCo's solver starts at the solution of the unperturbed step. Both
     steps then end equally near to their solutions, so that the solver's tolerance is not divided by the difference.
     """
-    moved, reached, nv = stack(W), stack(N), int(p[NV])
-    copy(z, W, moved)
+    perturbed, reached, nv = stack(W), stack(N), int(p[NV])
+    copy(z, W, perturbed)
     j = k + N if k < M else W - 1 - k
-    moved[j] += side * WIDTH * max(1.0, abs(z[j]))
-    step_from(moved, z, p, addresses, accelerations, 2 if j >= 2 * nv else 1 if j >= nv else 0, reached)
+    perturbed[j] += side * WIDTH * max(1.0, abs(z[j]))
+    step_from(perturbed, z, p, addresses, accelerations, 2 if j >= 2 * nv else 1 if j >= nv else 0, reached)
     for i in range(N):
-        jacobian[i, j] = (reached[i] - arrived[i]) / (moved[j] - z[j])
+        jacobian[i, j] = (reached[i] - arrived[i]) / (perturbed[j] - z[j])
 
 
 def steps_in(x, u, p, h, z):
@@ -549,12 +549,12 @@ def find_nearest_with_data(p, addresses, data, displaced, offset, first, out, wh
         out[first + row], which[row] = data[REACH], -1.0
     for k in range(int(data[2])):
         pair = PAIRS + PAIR_LENGTH * k
-        row, own, other = int(data[pair]), 3 * int(data[pair + 1]), 3 * int(data[pair + 3])
+        row, robot, other = int(data[pair]), 3 * int(data[pair + 1]), 3 * int(data[pair + 3])
         before_x, before_y, before_z = middles[other], middles[other + 1], middles[other + 2]
         if offset >= 0:
             for i in range(3):
                 middles[other + i] += displaced[offset + 3 * row + i]
-        x, y, z = middles[own] - middles[other], middles[own + 1] - middles[other + 1], middles[own + 2]
+        x, y, z = middles[robot] - middles[other], middles[robot + 1] - middles[other + 1], middles[robot + 2]
         z -= middles[other + 2]
         if data[pair + 5] == 1:
             apart = axes[3 * other + 2] * x + axes[3 * other + 5] * y + axes[3 * other + 8] * z
@@ -563,7 +563,7 @@ def find_nearest_with_data(p, addresses, data, displaced, offset, first, out, wh
         least = out[first + row]
         if not apart - data[pair + 4] >= least:
             distance = call_for_value(
-                p[DISTANCE], at(p[DISTANCE_MODEL]), at(addresses[DATA]), int32(own // 3), int32(other // 3),
+                p[DISTANCE], at(p[DISTANCE_MODEL]), at(addresses[DATA]), int32(robot // 3), int32(other // 3),
                 least, segment,
             )  # fmt: skip
             if not distance >= least:
@@ -572,7 +572,7 @@ def find_nearest_with_data(p, addresses, data, displaced, offset, first, out, wh
         middles[other], middles[other + 1], middles[other + 2] = before_x, before_y, before_z
 
 
-def write_normal(addresses, own, other, distance, segment, normal):
+def write_normal(addresses, robot, other, distance, segment, normal):
     """Write the direction from the robot's nearest point to the obstacle's; if both coincide, from centre to centre."""
     length = 0.0
     for i in range(3):
@@ -583,7 +583,7 @@ def write_normal(addresses, own, other, distance, segment, normal):
         middles = at(addresses[GEOM_XPOS])
         sign, length = 1.0, 0.0
         for i in range(3):
-            normal[i] = middles[3 * other + i] - middles[3 * own + i]
+            normal[i] = middles[3 * other + i] - middles[3 * robot + i]
             length += normal[i] * normal[i]
     scale = sign / sqrt(length) if length > 0 else 0.0
     for i in range(3):

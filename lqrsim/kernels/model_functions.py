@@ -4,7 +4,7 @@ Passes and iterations are therefore compiled once per size, and serve all proble
 `records.ProblemModel`.
 """
 
-from lqrsim.kernels.declarations import HESSIANS, STATES, M, N, W, call, call_for_value, compact, stack, zeros
+from lqrsim.kernels.declarations import FIRST, HESSIANS, STATES, M, N, W, call, call_for_value, compact, stack, zeros
 from lqrsim.kernels.linear_algebra import clear, copy, copy_matrix, fill, step_offset
 from lqrsim.kernels.records import NextStep
 
@@ -123,8 +123,8 @@ def cost_of_order(x, u, t, cost, second_order, hessian, gradient):
     The Hessian (W, W) is second_order H + (1 - second_order) H+. In H+ the sum of the terms that may be indefinite is
     projected to the nearest positive-semidefinite matrix.
     """
-    own = cost_alone(x, u, t, cost, second_order, hessian, gradient)
-    return own + augment_cost(x, u, t, cost, hessian, gradient)
+    value = cost_alone(x, u, t, cost, second_order, hessian, gradient)
+    return value + augment_cost(x, u, t, cost, hessian, gradient)
 
 
 def cost_alone(x, u, t, cost, second_order, hessian, gradient):
@@ -162,11 +162,16 @@ def evaluate_constraints(steps, states, controls, constraints, values):
     for t in range(steps + 1):
         u = controls[min(t, steps - 1)]
         for k in range(constraints.size):
-            acts = 0 if t == steps and constraints.functions[k, USES_CONTROL] != 0 else 1  # there is no last control
+            acts = acts_at(k, t, steps, constraints)
             call(
                 constraints.functions[k, VALUES],
                 states[t], u, t, acts, constraints.data[k], constraints.multipliers[k], values[k],
             )  # fmt: skip
+
+
+def acts_at(k, t, steps, constraints):
+    """Whether constraint k acts at a step; those of the control do not at the last one, which has none."""
+    return t >= constraints.multipliers[k][FIRST] and not (t == steps and constraints.functions[k, USES_CONTROL] != 0)
 
 
 def slope_of_constraint(which, row, x, u, t, constraints, gradient):

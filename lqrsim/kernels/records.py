@@ -21,8 +21,8 @@ Record = TypeVar("Record", bound=tuple[Any, ...])
 
 def zeros_of(kind: type[Record], given: Mapping[str, Any] | None = None, /, **sizes: int) -> Record:
     """A record of what is given, and of arrays of zeros, as large as its annotations say for these sizes."""
-    own = given or {}
-    return kind(*(own[name] if name in own else _zeros(hint, sizes) for name, hint in _hints(kind).items()))
+    known = given or {}
+    return kind(*(known[name] if name in known else _zeros(hint, sizes) for name, hint in _hints(kind).items()))
 
 
 @functools.cache
@@ -35,7 +35,7 @@ def _zeros(hint: Any, sizes: Mapping[str, int]) -> Any:
     if get_origin(hint) is not Annotated:
         return zeros_of(hint, **sizes)
     kind, (text,) = hint.__origin__, hint.__metadata__
-    pairs = (one.partition("+") for one in text.split())
+    pairs = (size.partition("+") for size in text.split())
     shape = [(int(name) if name.isdigit() else sizes[name]) + int(more or 0) for name, _, more in pairs]
     return np.zeros(shape) if kind is Arrays else kind(*(np.zeros(shape) for _ in kind._fields))
 
@@ -400,7 +400,7 @@ class SmootherArrays(NamedTuple):
     smoothing: SmootherGains
     homotopy_scaled: Any  # the stage cost of the passes; not the true one in the first iterations of a homotopy
     prior: Prior
-    given: Motion  # what guides the first pass
+    guess: Motion  # what guides the first pass
     best: Motion  # the best trajectory so far
     last: Motion  # that of the last policy
     last_policy: Policy
@@ -486,7 +486,7 @@ class LoopWork(NamedTuple):
     P: Annotated[Arrays, "L C X X"]  # covariance of X
     M: Annotated[Arrays, "L C X X"]  # of X' = M X and noise
     driven: Annotated[Arrays, "L C Y X"]  # M P for y alone
-    given: Annotated[Arrays, "L R R"]  # covariance of d
+    exogenous: Annotated[Arrays, "L R R"]  # covariance of d
     half: Annotated[Arrays, "R R"]  # the transition times it
     mean: Annotated[Arrays, "L C Y"]  # of y
     ahead: Annotated[Arrays, "Y"]  # of y at the next knot

@@ -61,18 +61,18 @@ def dot(a, i, b, k, count):
 def spread(t, system, sizes, loops, work):
     """Write the covariance of d at knot t."""
     R = sizes.entries - sizes.driven
-    given, noise = R * R * system, R * R * (sizes.systems * t + system)
+    first, noise = R * R * system, R * R * (sizes.systems * t + system)
     fill(work.half, R * R, 0.0)
     for i in range(R if t > 0 else 0):
         for a in range(R):
             if loops.transition[R * i + a] != 0.0:
-                add_row(loops.transition[R * i + a], work.given, given + R * a, work.half, R * i, R)
+                add_row(loops.transition[R * i + a], work.exogenous, first + R * a, work.half, R * i, R)
     for i in range(R):
-        copy_part(loops.fresh, noise + R * i, work.given, given + R * i, R)
+        copy_part(loops.fresh, noise + R * i, work.exogenous, first + R * i, R)
         for a in range(R if t > 0 else 0):
             if loops.transition[R * i + a] != 0.0:
                 for j in range(R):
-                    work.given[given + R * i + j] += loops.transition[R * i + a] * work.half[R * j + a]
+                    work.exogenous[first + R * i + j] += loops.transition[R * i + a] * work.half[R * j + a]
 
 
 @outline
@@ -100,7 +100,7 @@ def arrive(t, system, law, sizes, loops, work, moments):
     for i in range(R):
         for j in range(Y):
             work.P[P + X * (Y + i) + j] = work.P[P + X * j + Y + i]
-        copy_part(work.given, R * (R * system + i), work.P, P + X * (Y + i) + Y, R)
+        copy_part(work.exogenous, R * (R * system + i), work.P, P + X * (Y + i) + Y, R)
     at = sizes.systems * sizes.laws * t + k
     last = at - sizes.systems * sizes.laws
     for i in range(count):
@@ -115,10 +115,10 @@ def act(t, system, law, sizes, loops, work, moments):
     """Write M of X' = M X and noise under the limited commands of step t, the next mean, and what noise is left."""
     Y, X, m = sizes.driven, sizes.entries, sizes.controls
     k, loop = sizes.laws * system + law, sizes.systems * t + system
-    P, x, own, at = X * X * k, Y * k, m * k, m * (sizes.systems * sizes.laws * t + k)
+    P, x, first, at = X * X * k, Y * k, m * k, m * (sizes.systems * sizes.laws * t + k)
     K, F, G, c = m * X * (sizes.laws * t + law), Y * X * loop, m * Y * loop, Y * loop
     for a in range(m):
-        row, slopes, chosen = X * (own + a), K + X * a, m * (sizes.laws * t + law) + a
+        row, slopes, chosen = X * (first + a), K + X * a, m * (sizes.laws * t + law) + a
         for j in range(X):
             work.response[row + j] = 0.0
         add_rows(X, loops.K, slopes, 1, work.P, P, X, work.response, row, X)
@@ -127,16 +127,16 @@ def act(t, system, law, sizes, loops, work, moments):
         centre = loops.command[chosen] + dot(loops.K, slopes, work.mean, x, Y)
         slope, level, left = limit(centre, std, loops.low[a], loops.high[a])
         moments.command[at + a], moments.saturation[at + a] = std, 1.0 - slope
-        work.slope[own + a], work.level[own + a], work.left[own + a] = slope, level, left
+        work.slope[first + a], work.level[first + a], work.left[first + a] = slope, level, left
         for j in range(X):
             work.law[row + j] = slope * loops.K[slopes + j]
     for i in range(Y):
         row = P + X * i
         copy_part(loops.F, F + X * i, work.M, row, X)
-        add_rows(m, loops.G, G + i, Y, work.law, X * own, X, work.M, row, X)
+        add_rows(m, loops.G, G + i, Y, work.law, X * first, X, work.M, row, X)
         total = loops.c[c + i] + dot(loops.F, F + X * i, work.mean, x, Y)
         for a in range(m):
-            total += loops.G[G + Y * a + i] * (work.level[own + a] - loops.planned[m * t + a])
+            total += loops.G[G + Y * a + i] * (work.level[first + a] - loops.planned[m * t + a])
         work.ahead[i] = total
     shake(t, system, law, sizes, loops, work)
     copy_part(work.ahead, 0, work.mean, x, Y)
@@ -146,29 +146,29 @@ def act(t, system, law, sizes, loops, work, moments):
 def shake(t, system, law, sizes, loops, work):
     """Write the products with G of the commands' noise, and of what a loss changes, for `disturb`."""
     Y, X, m, S = sizes.driven, sizes.entries, sizes.controls, sizes.stated
-    k, loop, given = sizes.laws * system + law, sizes.systems * t + system, sizes.laws * t + law
-    own, G, force = m * k, m * Y * loop, S - m
+    k, loop, of_law = sizes.laws * system + law, sizes.systems * t + system, sizes.laws * t + law
+    first, G, force = m * k, m * Y * loop, S - m
     for a in range(m):
-        row = Y * (own + a)
+        row = Y * (first + a)
         for i in range(Y):
             work.pushed[row + i] = 0.0
             work.held[row + i] = 0.0
             if sizes.correlated:
-                work.shaken[row + i] = work.slope[own + a] * loops.jointly[Y * (m * given + a) + i]
+                work.shaken[row + i] = work.slope[first + a] * loops.jointly[Y * (m * of_law + a) + i]
                 work.pushed[row + i] = work.shaken[row + i]
         for b in range(m):
-            noise = work.slope[own + a] * loops.shaking[m * (m * given + a) + b] * work.slope[own + b]
+            noise = work.slope[first + a] * loops.shaking[m * (m * of_law + a) + b] * work.slope[first + b]
             if a == b:
-                noise += work.left[own + a]
+                noise += work.left[first + a]
             add_row(noise, loops.G, G + Y * b, work.pushed, row, Y)
             if sizes.lossy:
                 # E[(u - a) (u - a)'] of the command u and the one in force, a.
-                apart = work.level[own + a] - loops.reached[m * loop + a] - work.mean[Y * k + force + a]
-                apart *= work.level[own + b] - loops.reached[m * loop + b] - work.mean[Y * k + force + b]
-                square = noise + apart - work.slope[own + a] * work.response[X * (own + a) + force + b]
-                square -= work.slope[own + b] * work.response[X * (own + b) + force + a]
+                apart = work.level[first + a] - loops.reached[m * loop + a] - work.mean[Y * k + force + a]
+                apart *= work.level[first + b] - loops.reached[m * loop + b] - work.mean[Y * k + force + b]
+                square = noise + apart - work.slope[first + a] * work.response[X * (first + a) + force + b]
+                square -= work.slope[first + b] * work.response[X * (first + b) + force + a]
                 square += work.P[X * (X * k + force + a) + force + b]
-                square += work.slope[own + a] * dot(work.response, X * (own + a), work.law, X * (own + b), X)
+                square += work.slope[first + a] * dot(work.response, X * (first + a), work.law, X * (first + b), X)
                 add_row(sizes.lost * square, loops.G, G + Y * b, work.held, row, S)
 
 
@@ -323,11 +323,11 @@ def go_back(t, k, sizes, arrays, work):
         copy_part(work.products, first + row * i, work.cost, cost + width * i, width)
         add_rows(m, work.products, first + row * i + width, 1, work.mean, 0, width, work.cost, cost + width * i, width)
     for a in range(m if lost > 0.0 else 0):
-        own, at = first + row * (Y + a), cost + width * (force + a)
-        add_row(lost, work.products, own, work.cost, at, width)
+        pushed, at = first + row * (Y + a), cost + width * (force + a)
+        add_row(lost, work.products, pushed, work.cost, at, width)
         for j in range(m * width):
             work.mean[j] = lost * arrays.held[held + j]
-        add_rows(m, work.products, own + width, 1, work.mean, 0, width, work.cost, at, width)
+        add_rows(m, work.products, pushed + width, 1, work.mean, 0, width, work.cost, at, width)
     for i in range(Y):
         for j in range(i):
             mean = 0.5 * (work.cost[cost + width * i + j] + work.cost[cost + width * j + i])

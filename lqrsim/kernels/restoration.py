@@ -206,9 +206,9 @@ def model_penalties(price, stages, work, mem):
             continue
         middle = parameter / excess
         high = min(max(highest - work.duals[at], middle / WIDE), middle * WIDE)
-        own = 1 / (lower_slack / low + excess / high)
+        curve = 1 / (lower_slack / low + excess / high)
         both = 2 * excess if rows.kinds[at] == EQUALITY else slack + excess
-        work.curves[at] = own + min(mem.damping, 1.0) * max(parameter / (slack * both) - own, 0.0)
+        work.curves[at] = curve + min(mem.damping, 1.0) * max(parameter / (slack * both) - curve, 0.0)
     mem.has_duals = 1.0
 
 

@@ -190,12 +190,12 @@ def coordinate_descent(stage, x, limits, u):
     low, high = limits.low, limits.high
     clamp(u, limits)
     for _ in range(1000):
-        moved, size = 0.0, 0.0
+        change, size = 0.0, 0.0
         for i in range(M):
             new = min(max(u[i] - slope_at(stage, x, u, i) / stage.hessian[N + i, N + i], low[i]), high[i])
-            moved, size = max(moved, abs(new - u[i])), max(size, abs(new))
+            change, size = max(change, abs(new - u[i])), max(size, abs(new))
             u[i] = new
-        if not moved > 1e-14 * size:
+        if not change > 1e-14 * size:
             break
 
 
@@ -399,11 +399,11 @@ def dual_step(t, step, stage, constant, to_come, smoothing):
     if not update(U, Q, diagonal):
         return False
     for i in range(N):
-        moved = 0.0
+        shift = 0.0
         for j in range(N):
-            moved += U[i, j] * slope_at_mean[j]
-        updated[i] = mean[i] - moved
-        value -= 0.5 * slope_at_mean[i] * moved
+            shift += U[i, j] * slope_at_mean[j]
+        updated[i] = mean[i] - shift
+        value -= 0.5 * slope_at_mean[i] * shift
     # Predict along the step, with the control as noise.
     for i in range(N):
         for j in range(N):

@@ -225,12 +225,12 @@ def advance_in_parts(x, u, p, h, out):
 @compact
 def step_jacobian_in_parts(x, u, p, h, out, jacobian):
     """Write the state (N,) after `h` seconds, and its Jacobian `[A B]` (N, W)."""
-    z, own = stack(N), stack(N, W)
+    z, step = stack(N), stack(N, W)
     copy(x, N, z)
     begin(jacobian)
     for _ in range(PARTS):
-        step_jacobian(z, u, p, h / PARTS, out, own)
-        follow(own, jacobian, jacobian)
+        step_jacobian(z, u, p, h / PARTS, out, step)
+        follow(step, jacobian, jacobian)
         copy(out, N, z)
 
 
@@ -238,12 +238,12 @@ def step_jacobian_in_parts(x, u, p, h, out, jacobian):
 def step_curvature_in_parts(x, u, p, h, weights, out, jacobian, hessian):
     """Write a period and its Jacobian; add `sum_i weights[i] d2 out[i] / d(x, u)2`, (W, W)."""
     states, slopes = stack(PARTS + 1, N), stack(PARTS + 1, N, W)  # at the beginning of each step, and at the end
-    own, w, before = stack(N, W), stack(N), stack(N)
+    step, w, before = stack(N, W), stack(N), stack(N)
     copy(x, N, states[0])
     begin(slopes[0])
     for k in range(PARTS):
-        step_jacobian(states[k], u, p, h / PARTS, states[k + 1], own)
-        follow(own, slopes[k], slopes[k + 1])
+        step_jacobian(states[k], u, p, h / PARTS, states[k + 1], step)
+        follow(step, slopes[k], slopes[k + 1])
     for i in range(N):
         out[i] = states[PARTS, i]
         w[i] = weights[i]
@@ -252,12 +252,12 @@ def step_curvature_in_parts(x, u, p, h, weights, out, jacobian, hessian):
     for back in range(PARTS):
         k = PARTS - 1 - back
         curve, arrived = zeros(W, W), stack(N)
-        step_curvature(states[k], u, p, h / PARTS, w, arrived, own, curve)
+        step_curvature(states[k], u, p, h / PARTS, w, arrived, step, curve)
         pull_back(curve, slopes[k], hessian)
         for j in range(N):
             before[j] = 0.0
             for i in range(N):
-                before[j] += own[i, j] * w[i]
+                before[j] += step[i, j] * w[i]
         copy(before, N, w)
 
 

@@ -8,7 +8,7 @@ curves and forces: see `interior_point.py`, `active_set.py` and `restoration.py`
 from math import inf, sin, sqrt
 
 from lqrsim.kernels.certificate import reduce_stage
-from lqrsim.kernels.declarations import FIRST, MIXES, ROWS, M, N, W, stack, zeros
+from lqrsim.kernels.declarations import MIXES, ROWS, M, N, W, stack, zeros
 from lqrsim.kernels.linear_algebra import (
     affine,
     cholesky,
@@ -22,7 +22,7 @@ from lqrsim.kernels.linear_algebra import (
     set_entry,
 )
 from lqrsim.kernels.model_functions import (
-    USES_CONTROL,
+    acts_at,
     advance,
     advance_all,
     all_steps_second_order,
@@ -144,11 +144,6 @@ def constraint_slopes(stages, plan):
                 for i in range(W):
                     if slope[i] != 0:
                         rows.support[place, i] = 1.0
-
-
-def acts_at(k, t, steps, constraints):
-    """Whether constraint k acts at a step."""
-    return t >= constraints.multipliers[k][FIRST] and not (t == steps and constraints.functions[k, USES_CONTROL] != 0)
 
 
 def subtract_curvatures(x, u, t, stages, least, hessian):

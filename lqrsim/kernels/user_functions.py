@@ -76,32 +76,32 @@ def derivatives(x, u, t, data, hessian, gradient):
 
 def places(x, data, out):
     """Write the centres of balls, three coordinates each; the third is 0 in a plane."""
-    given = stack(BALLS * COORDINATES)
-    fill(given, BALLS * COORDINATES, nan)
-    call(data[0], x, x, data, given)
+    returned = stack(BALLS * COORDINATES)
+    fill(returned, BALLS * COORDINATES, nan)
+    call(data[0], x, x, data, returned)
     for k in range(BALLS):
         out[3 * k + 2] = 0.0
         for i in range(COORDINATES):
-            out[3 * k + i] = given[COORDINATES * k + i]
+            out[3 * k + i] = returned[COORDINATES * k + i]
 
 
 def places_jacobian(x, data, out, slopes):
     """Write the centres, and their Jacobian (3 balls, N), which the caller has set to zero."""
-    given = zeros(BALLS * COORDINATES, N)
+    returned = zeros(BALLS * COORDINATES, N)
     places(x, data, out)
-    call(data[1], x, x, data, given)
+    call(data[1], x, x, data, returned)
     for k in range(BALLS):
         for i in range(COORDINATES):
             for j in range(N):
-                slopes[3 * k + i, j] = given[COORDINATES * k + i, j]
+                slopes[3 * k + i, j] = returned[COORDINATES * k + i, j]
 
 
 def noise_values(x, u, data, out):
     """Write the noise matrix M (N, COLUMNS), times its strength."""
-    given = stack(N, COLUMNS)
+    returned = stack(N, COLUMNS)
     for i in range(N):
-        fill(given[i], COLUMNS, nan)
-    call(data[0], x, u, data, given)
+        fill(returned[i], COLUMNS, nan)
+    call(data[0], x, u, data, returned)
     for i in range(N):
         for k in range(COLUMNS):
-            out[i, k] = data[STRENGTH] * given[i, k]
+            out[i, k] = data[STRENGTH] * returned[i, k]

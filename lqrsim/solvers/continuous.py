@@ -487,8 +487,8 @@ class _Smoother:
         self, problem: Problem, state: Array, control: Array, prior: InitialPrior | None, tolerances: Tolerances
     ) -> None:
         costs, data, dynamics = compiled.costs_module(problem), compiled.compile_problem(problem), problem.dynamics
-        self._n, self._m = n, m = len(state), len(control)
-        self._dt, self._steps, self.horizon = problem.dt, problem.steps, problem.steps * problem.dt
+        n, m, dt, steps = len(state), len(control), problem.dt, problem.steps
+        self._n, self._dt, self._steps, self.horizon = n, dt, steps, steps * dt
         self._tolerances, self._data, self._none = tolerances, data, np.zeros(m)
         # Buffers into which compiled code writes.
         self._f, self._fx, self._fu = np.zeros(n), np.zeros((n, n)), np.zeros((n, m))

@@ -280,7 +280,7 @@ class SolveRun:
         work = self.work
         arrays, homotopy_scaled = work.arrays, work.model._replace(stage=work.homotopy_scaled(self._fractions[0]))
         failed, good = work.core.opening_pass(
-            self.problem.steps, self.initial_guess.trajectory is not None, arrays.given, work.prior, homotopy_scaled,
+            self.problem.steps, self.initial_guess.trajectory is not None, arrays.guess, work.prior, homotopy_scaled,
             arrays.policy, arrays.to_go,
         )  # fmt: skip
         if failed >= 0:
@@ -658,7 +658,7 @@ class Workspace:
             array[...] = numbers
         # Without a trajectory, use the start state, and the controls with which the dynamics can run backwards.
         plan = initial_guess.trajectory
-        for array in (arrays.given, arrays.best):
+        for array in (arrays.guess, arrays.best):
             array.states[...] = start if plan is None else plan.states
             array.controls[...] = initial_guess.offset if plan is None else plan.controls
 

@@ -115,9 +115,9 @@ class Ellipsoids:
         chosen = list(knots[:1])
         for knot in knots[1:]:
             before = chosen[-1]
-            moved = np.linalg.norm(self.centres[knot] - self.centres[before])
+            apart = np.linalg.norm(self.centres[knot] - self.centres[before])
             grown = abs(half_axes[knot] - half_axes[before])
-            if moved + grown >= APART * half_axes[knot] or knot == knots[-1]:
+            if apart + grown >= APART * half_axes[knot] or knot == knots[-1]:
                 chosen.append(knot)
         places = np.linspace(0, len(chosen) - 1, min(most, len(chosen))).astype(np.int64)
         return np.array(chosen, dtype=np.int64)[places]

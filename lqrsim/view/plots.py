@@ -302,14 +302,14 @@ def _visible(model: mujoco.MjModel, data: mujoco.MjData, tree: int) -> list[Obst
 
 def draw_objects(axes: Axes, objects: Sequence[MovedObject], plane: list[int]) -> None:
     """Draw objects at the beginning and at the end of a run, and their paths, in a plane of the world's axes."""
-    for moved in objects:
-        low, high = moved.path.min(axis=0), moved.path.max(axis=0)
-        for geoms, line, face in ((moved.first, ":", "none"), (moved.last, "-", (MOVED_COLOUR, 0.3))):
+    for body in objects:
+        low, high = body.path.min(axis=0), body.path.max(axis=0)
+        for geoms, line, face in ((body.first, ":", "none"), (body.last, "-", (MOVED_COLOUR, 0.3))):
             properties = {"facecolor": face, "edgecolor": MOVED_COLOUR, "linestyle": line, "zorder": 2.4}
             for geom in geoms:
                 axes.fill(*_outline(geom, low, high, plane).T, **properties)
-        label = f"{moved.name.replace('_', ' ')}, moved"
-        axes.plot(*moved.path[:, plane].T, color=MOVED_COLOUR, linewidth=1.0, zorder=2.5, label=label)
+        label = f"{body.name.replace('_', ' ')}, moved"
+        axes.plot(*body.path[:, plane].T, color=MOVED_COLOUR, linewidth=1.0, zorder=2.5, label=label)
 
 
 def draw_sensed(axes: Axes, belief: Belief, states: Array, low: Array, high: Array, along: list[int]) -> None:
@@ -470,9 +470,9 @@ def _of_positions(solution: Solution, rollouts: Mapping[str, Rollout], world: Wo
     first, space = next(iter(rollouts.values())), solution.policy.state_coordinates
     driven = _driven(rollouts, trial)
     plan = DrawnPath(solution.trajectory.states[:, list(space.position)], "planned")
-    moved = moved_objects(first, trial)
+    objects = moved_objects(first, trial)
     of_world = ["xyz".index(letter) for letter in (space.plane if len(space.position) == 2 else "xyz")]
-    shown = [thing.places[:, of_world] for thing in moved]
+    shown = [thing.places[:, of_world] for thing in objects]
     places = np.vstack([*(path.points for path in (*driven, plan)), *shown])
     tubes = list[TubeArea]()
     for (name, run), color in zip(rollouts.items(), RUNS, strict=False):
@@ -481,7 +481,7 @@ def _of_positions(solution: Solution, rollouts: Mapping[str, Rollout], world: Wo
             tubes.append(TubeArea(ellipsoids, f"{AREA}{name}, {ellipsoids.label}", _paler(color, 0.6), color))
     return Views(
         title="path", space=space, world=world, radius=first.radius, places=places, planes=planes_of(places),
-        paths=[*driven, plan], tubes=tubes, objects=moved,
+        paths=[*driven, plan], tubes=tubes, objects=objects,
     )  # fmt: skip
 
 
