@@ -211,15 +211,16 @@ class CompiledModule:
         return loaded, returns
 
 
-@functools.cache
-def _module_of(source: Source, sizes: tuple[tuple[str, int], ...], what: str) -> CompiledModule:
-    return CompiledModule(source, dict(sizes), what)
+_modules: dict[Any, CompiledModule] = {}
 
 
 def module_of(source: Source, what: str, **sizes: int) -> CompiledModule:
     """The CompiledModule of a source and sizes, those of `kernels/declarations.py`, one per process."""
+    key = source, what, *sizes.items()
     with compiling:  # a further reason: Python 3.11 cannot parse in two threads at once
-        return _module_of(source, tuple(sizes.items()), what)
+        if key not in _modules:
+            _modules[key] = CompiledModule(source, sizes, what)
+        return _modules[key]
 
 
 def _signature(name: str, sizes: Mapping[str, int]) -> Group:

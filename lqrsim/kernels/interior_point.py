@@ -559,12 +559,8 @@ def centre(stages, work, mem):
     complete(False, work.centring, work.alternative, stages, work, mem)
     other_fraction, _ = longest(tau, slacks, work.alternative, stages)
     if other_fraction >= fraction + FURTHER * REACH:
-        count = rows.size * (stages.steps + 1)
-        copy_matrix(work.centring, count, 2, corrections)
-        copy_matrix(work.alternative.slacks, count, 2, step.slacks)
-        copy(work.alternative.force, count, step.force)
-        copy_plan(stages.steps, work.alternative.changes, step.changes)
-        copy_matrix(work.alternative.costates, stages.steps + 1, N, step.costates)
+        copy_matrix(work.centring, rows.size * (stages.steps + 1), 2, corrections)
+        complete(False, corrections, step, stages, work, mem)
 
 
 @inline
