@@ -222,7 +222,7 @@ def test_moments_of_several_laws_are_those_of_a_plain_recursion(structure: int, 
     found = LinearLoop(model, gain, offset, None, limits).moments(n)
     shown, (F, G, c), onto_force = (
         np.diag(model.measurement_std**2),
-        model.step_if_arrived,
+        model.step_with(model.arrived),
         np.eye(m, model.size, n),
     )
     for i in range(3):

@@ -263,6 +263,7 @@ class PlanModel:
         self.output = np.concatenate([np.zeros((len(self.parameters) + 2 * self.m, 0)), *columns], axis=1)
         self.size = self.n + self.lagging + len(self.transition)
         states = self.dynamics.state_coordinates
+        self._steps = dict[Lag, LinearSteps]()
         self.measurement_std = per_entry("Uncertainty: measurement", uncertainty.measurement, states)
 
     def _weights(self, unknown: Unknown) -> Array:
@@ -316,17 +317,15 @@ class PlanModel:
         B, slopes = self.derivatives.jacobian[:, :, self.n :], map(self.derivatives.effect, self.parameters)
         return np.concatenate([*slopes, B * self.plan.controls[:, None, :], B], axis=2)
 
-    @cached_property
+    @property
     def step(self) -> LinearSteps:
         """The model, as a mean over commands that arrive and commands that get lost."""
-        return self._steps(self.lag)
+        return self.step_with(self.lag)
 
-    @cached_property
-    def step_if_arrived(self) -> LinearSteps:
-        """The model for a command that arrives: a lost one is as if it had been the actuators' states."""
-        return self.step if self.arrived == self.lag else self._steps(self.arrived)
-
-    def _steps(self, lag: Lag) -> LinearSteps:
+    def step_with(self, lag: Lag) -> LinearSteps:
+        """The model for a lag: with `arrived`, a lost command is as if it had been the actuators' states."""
+        if lag in self._steps:
+            return self._steps[lag]
         n, a, steps, jacobian = self.n, self.lagging, self.plan.steps, self.derivatives.jacobian
         F, G = np.zeros((steps, self.size, self.size)), np.zeros((steps, self.size, self.m))
         F[:, :n, :n] = jacobian[:, :, :n]
@@ -341,7 +340,8 @@ class PlanModel:
             behind = self.reached[:-1] - self.plan.controls
             c[:, :n] = np.einsum("tij,tj->ti", jacobian[:, :, n:], lag.mean * behind)
             c[:, n : n + a] = (lag.left - self.lag.left) * behind
-        return LinearSteps(F, G, c)
+        self._steps[lag] = LinearSteps(F, G, c)
+        return self._steps[lag]
 
     @cached_property
     def reached(self) -> Array:
@@ -373,7 +373,8 @@ class PlanModel:
         white = [unknown.std * self._weights(unknown) for unknown in uncertainty.unknowns if unknown.white]
         constant = m + len(white)
         root = np.zeros((self.plan.steps, self.size, constant + n + self.size - first))
-        root[:, :, :m] = self.step_if_arrived.G * per_entry("Uncertainty: control", uncertainty.control, controls)
+        commanded = self.step_with(self.arrived).G
+        root[:, :, :m] = commanded * per_entry("Uncertainty: control", uncertainty.control, controls)
         if uncertainty.lag == 0:
             root[:, n:first, :m] = 0.0  # the command that stays in force after a loss has new noise
         if white:

@@ -139,7 +139,7 @@ def tracking_law(model: PlanModel, weights: Weights, noise: Array | None = None,
     movable, width = n + model.lagging, model.size + 1  # the states that controls can move, and numbers of (y, d, 1)
     state, end = np.atleast_2d(weights.state), np.atleast_2d(weights.end)
     # (y', d, 1) of (y, d, 1, u): the law assumes that d goes on as it is.
-    (F, G, c), forward = model.step_if_arrived, np.zeros((steps, width, width + m))
+    (F, G, c), forward = model.step_with(model.arrived), np.zeros((steps, width, width + m))
     forward[:, :movable] = np.concatenate([F, c[:, :, None], G], axis=2)[:, :movable]
     forward[:, range(movable, width), range(movable, width)] = 1.0
     adjoint = np.concatenate([F[:, :movable, :movable], G[:, :movable]], axis=2).transpose(0, 2, 1)
@@ -247,13 +247,16 @@ class Judge:
         """
         target, radius = self.solution.target, self.solution.goal_radius
         if place := target.places:
-            widest = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[..., place, :][..., place])[..., -1], 0.0))
-            off = np.linalg.norm(mean[..., place], axis=-1)
-            return np.zeros(off.shape) if radius is None else _chance_outside(radius, off, widest)
-        radius = target.radius(None, None, None) if radius is None else radius
-        counts, variance = np.isfinite(target.state), np.diagonal(covariance, axis1=-2, axis2=-1)
-        bounds, std = radius * target.scale, np.sqrt(np.maximum(variance, 0.0))
-        return 1 - np.prod(1 - _chance_outside(bounds, np.abs(mean), std)[..., counts], axis=-1)
+            if radius is None:
+                return np.zeros(mean.shape[:-1])
+            bounds, off = radius, np.linalg.norm(mean[..., place], axis=-1)
+            variance = np.linalg.eigvalsh(covariance[..., place, :][..., place])[..., -1]
+        else:
+            bounds = (target.radius(None, None, None) if radius is None else radius) * target.scale
+            off, variance = np.abs(mean), np.diagonal(covariance, axis1=-2, axis2=-1)
+        std = np.maximum(np.sqrt(np.maximum(variance, 0.0)), 1e-12)
+        outside = ndtr((off - bounds) / std) + ndtr((-off - bounds) / std)  # of normal numbers with these means
+        return outside if place else 1 - np.prod(1 - outside[..., np.isfinite(target.state)], axis=-1)
 
     def narrowest(self, widths: Array) -> float:
         """The width of the narrowest tube; a thousandth of the plan's extent by the norm is narrow enough."""
@@ -283,12 +286,6 @@ class Judge:
             return count
         run = Feedback(policy)
         return int((sample_loop(self.truth, run, self.limits, OPEN, self.norm, TRIALS, 0).farthest > farthest).sum())
-
-
-def _chance_outside(bound: Array | float, off: Array, std: Array) -> Array:
-    """The chance that normal numbers with these means exceed a bound in size."""
-    std = np.maximum(std, 1e-12)
-    return ndtr((off - bound) / std) + ndtr((-off - bound) / std)
 
 
 def choose_tolerances(judge: Judge, model: PlanModel, effort: Array, at_end: float, *, call: str) -> DeviationLaw:
