@@ -103,6 +103,19 @@ def test_an_episode_is_the_trial_of_simulate(case: tuple[str, ls.Scenario, ls.So
             assert steps == scenario.problem.steps
 
 
+def test_a_filter_as_an_agent_takes_repeated_measurements_for_lost(case: tuple[str, ls.Scenario, ls.Solution]) -> None:
+    """Observations say no more than that; with noise no two measurements are equal, and it flies as in `simulate`."""
+    name, scenario, solution = case
+    lossy = [ls.disturbances.MeasurementNoise(1e-3), ls.disturbances.MeasurementDropouts(0.3)]
+    law = ls.OffsetFree(scenario.problem, solution, ls.uncertainty_of(scenario.plant(), lossy))
+    rollout = ls.simulate(scenario.plant(), solution, controller=law, disturbances=lossy, seed=2, frames=False)
+    env: Any = gymnasium.make(name, solution=solution, disturbances=lossy, actions="controls")
+    _, rewards, _, _ = run(env, lqrsim.gym.Expert(env, law), seed=2)
+    own, steps = env.unwrapped.rollout(), len(rewards)
+    np.testing.assert_array_equal(own.applied[0, :steps], rollout.applied[0, :steps])
+    assert (own.measured[0, 1:] == own.measured[0, :-1]).all(axis=1).any()
+
+
 def test_many_at_once_are_the_same_trials(quadrotor: ls.Scenario, quadrotor_solution: ls.Solution) -> None:
     """Under severe disturbances, of which some trials collide; who has ended stands still."""
     plant = quadrotor.plant()
