@@ -239,7 +239,7 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
             "level": print_nothing, "progress": print_nothing,
         },),
         "smallest_failure": (searching | {
-            "failures": [[2.0, 0.0, 0.0]], "rounds": 1, "pairs": 4,
+            "failures": [[2.0, 0.0, 0.0]], "particles": 20, "rounds": 1, "pairs": 4, "level": print_nothing,
             "progress": print_nothing,
         },),
         "ReliabilityProblem": ({
