@@ -24,6 +24,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from refusing import error_line
 from sampling import is_short, rarely
 
 import lqrsim as ls
@@ -807,9 +808,7 @@ def test_bad_input_is_one_line(
     words = [word.format(own=own, out=out, reference=reference.folder) for word in command.split()]
     words += ["--out", str(out)] if words[0] == "stress" else []
     assert main(words) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("lqrsim: error: ")
-    assert error.count("\n") == 1
+    error = error_line(capsys)
     assert all(part in error for part in says), error
     assert not out.exists()
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from failing_solves import CASES
 from mechanisms import arm
+from refusing import error_line
 from sampling import rarely
 
 import lqrsim as ls
@@ -78,15 +79,6 @@ def simulate(solved: Path, out: Path, *options: str) -> ls.Rollout:
     return ls.load(out / "rollout.npz", ls.Rollout)
 
 
-def one_line(capsys: pytest.CaptureFixture[str]) -> str:
-    """The error message of the last command, which must be one line."""
-    error = capsys.readouterr().err
-    assert error.startswith("lqrsim: error: ")
-    assert error.count("\n") == 1
-    assert error.endswith("\n")
-    return error
-
-
 def test_list_names_every_scenario_with_units(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list"]) == 0
     printed = capsys.readouterr().out
@@ -103,7 +95,7 @@ def test_list_describes_the_robot_of_a_file(tmp_path: Path, capsys: pytest.Captu
     assert "  controls: hinge (N m)" in printed
     assert "  held at rest by: hinge" in printed
     assert main(["list", "arm.xml"]) == 2
-    assert "arm.xml" in one_line(capsys)
+    assert "arm.xml" in error_line(capsys)
 
 
 def test_solve_prints_the_log_and_writes_the_solution(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -285,7 +277,7 @@ def test_own_scenario_in_a_file(own: Path, tmp_path: Path, capsys: pytest.Captur
     capsys.readouterr()
     # A file of someone else's must not decide what code runs here.
     assert main(["simulate", str(solution)]) == 2
-    assert f"--scenario {reference}" in one_line(capsys)
+    assert f"--scenario {reference}" in error_line(capsys)
     assert main(["simulate", str(solution), "--scenario", reference]) == 0
 
 
@@ -302,7 +294,7 @@ def test_runs_are_named_after_the_scenario(
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert main(["simulate", str(solution)]) == 2
-    option = one_line(capsys).split("which runs only with ")[1].removesuffix("\n")
+    option = error_line(capsys).split("which runs only with ")[1].removesuffix("\n")
     assert main(["simulate", str(solution), *shlex.split(option)]) == 0
 
 
@@ -373,7 +365,7 @@ def test_bad_input_is_one_line(
     capsys.readouterr()
     places = {"solved": solved, "own": own, "tmp": tmp_path, "truncated": truncated}
     assert main([word.format(**places) for word in command.split()]) == 2
-    message = one_line(capsys)
+    message = error_line(capsys)
     assert all(part in message for part in says), message
     assert sorted(path.name for path in tmp_path.iterdir()) in (before, sorted([*before, "__pycache__"]))
 

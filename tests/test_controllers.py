@@ -4,11 +4,11 @@ import copy
 import dataclasses
 import re
 import threading
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from refusing import refusal
 from sampling import rarely
 
 import lqrsim as ls
@@ -23,12 +23,6 @@ TOLERATE = {"m": 0.05, "rad": 0.1}
 @pytest.fixture(scope="module")
 def plant(differential_drive: ls.Scenario) -> ls.Plant:
     return differential_drive.plant()
-
-
-def refusal(call: Callable[[], object]) -> str:
-    with pytest.raises(ls.InputError) as caught:
-        call()
-    return str(caught.value)
 
 
 # Functions of state and time.

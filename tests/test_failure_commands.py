@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from interrupting import interrupted
+from refusing import error_line
 from sampling import is_short, rarely
 from scipy import stats
 
@@ -310,10 +311,7 @@ def test_bad_input_is_one_line(
 ) -> None:
     out = tmp_path / "out"
     assert main([*(word.format(own=own) for word in command.split()), "--out", str(out)]) == 2
-    lines = capsys.readouterr().err.splitlines(keepends=True)
-    error = "".join(line for line in lines if not line.startswith("compiling "))  # which an empty cache needs
-    assert error.startswith("lqrsim: error: ")
-    assert error.count("\n") == 1
+    error = error_line(capsys)
     assert all(part in error for part in says), error
     assert not out.exists()
 

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from refusing import error_line
 from sampling import examples
 from scipy import stats
 from spoiling import content_hash, contents, rewrite
@@ -593,9 +594,7 @@ def test_commands_give_one_line(
         bad.mkdir()
         (bad / "manifest.json").write_text("[" * 9999)
     assert main([word.format(bad=bad, good=run, out=tmp_path / "out") for word in command.split()]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("lqrsim: error: ")
-    assert error.count("\n") == 1
+    error_line(capsys)
 
 
 @pytest.mark.parametrize(
@@ -611,9 +610,7 @@ def test_outputs_with_names_that_are_too_long_give_one_line(
 ) -> None:
     long = tmp_path / LONG
     assert main([word.format(solution=saved, run=run, long=long) for word in command.split()]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("lqrsim: error: ")
-    assert error.count("\n") == 1
+    error_line(capsys)
 
 
 @pytest.mark.parametrize("name", [LONG, f"{LONG}/solution.npz", "a\0b.npz", f"x.{LONG}"])

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from refusing import error_line
 from sampling import examples, is_short
 
 import lqrsim as ls
@@ -97,13 +98,6 @@ def test_rollouts_with_earlier_hashes_are_of_their_policy(left: ls.Solution, dif
 
 def shards(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((folder / "shards").iterdir())}
-
-
-def one_line(capsys: pytest.CaptureFixture[str]) -> str:
-    error = capsys.readouterr().err
-    assert error.startswith("lqrsim: error: ")
-    assert error.count("\n") == 1
-    return error
 
 
 # What runs.
@@ -199,11 +193,11 @@ def test_the_folder_has_all_that_it_takes_to_replay_and_to_go_on(
     # The same command without it, or with another, is another campaign.
     capsys.readouterr()
     assert main(["stress", DRIVE, *words]) == 2
-    assert f"solution: got none, want {folder / 'solution.npz'}, as {folder} was begun with" in one_line(capsys)
+    assert f"solution: got none, want {folder / 'solution.npz'}, as {folder} was begun with" in error_line(capsys)
     other = ls.save(dataclasses.replace(left, policy=left.open_loop().policy), tmp_path / "other.npz")
     for asked in (words, ["--resume", "--out", str(folder)]):
         assert main(["stress", DRIVE, *asked, "--solution", str(other)]) == 2
-        assert "solution: got another, want " in one_line(capsys)
+        assert "solution: got another, want " in error_line(capsys)
     assert shards(folder) == whole
 
 
@@ -275,7 +269,7 @@ def test_a_plan_of_another_problem_is_run_but_not_planned_again(
     assert ls.stress.Results(out).campaign.policies == ("smooth", "ilqr", "open_loop")
     again = [*FEW, "--solution", path, "--policies", "replan", "--out", str(tmp_path / "new")]
     assert main(["stress", DRIVE, *again]) == 2
-    assert f"policies: got {why}, want some of smooth, ilqr, open_loop, track" in one_line(capsys)
+    assert f"policies: got {why}, want some of smooth, ilqr, open_loop, track" in error_line(capsys)
     assert not (tmp_path / "new").exists()
 
 
@@ -341,7 +335,7 @@ def test_a_solution_of_another_system_is_refused_by_every_command(
     monkeypatch.chdir(tmp_path)
     assert main([command, "quadrotor", "--solution", str(stored)]) == 2
     says = f"solution: got {stored} with the states x, y, heading, want x, y, z, vx,"
-    assert says in one_line(capsys)
+    assert says in error_line(capsys)
     assert not any(tmp_path.iterdir())
 
 
@@ -387,4 +381,4 @@ def test_what_does_not_fit_is_refused_by_name(
 
 def test_a_recorded_run_has_its_own(stored: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["view", str(tmp_path / "rollout.npz"), "--solution", str(stored)]) == 2
-    assert "--solution: got" in one_line(capsys)
+    assert "--solution: got" in error_line(capsys)

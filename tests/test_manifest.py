@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from llvmlite.binding import FeatureMap
+from refusing import error_line
 
 import lqrsim as ls
 from lqrsim import machine
@@ -125,9 +126,7 @@ def test_what_was_edited_is_refused(
     ]
     for command in commands:
         assert main(command) == 2
-        error = capsys.readouterr().err
-        assert error.startswith("lqrsim: error: folder: got ")
-        assert error.count("\n") == 1
+        assert error_line(capsys).startswith("lqrsim: error: folder: got ")
     assert sorted((folder / "shards").iterdir()) == shards
 
 

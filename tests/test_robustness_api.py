@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusing import refusal
 from sampling import examples, rarely
 
 import lqrsim as ls
@@ -30,7 +31,6 @@ from lqrsim.codegen.printer import Value
 from lqrsim.commands.solving import tube_under
 from lqrsim.disturbances import Uncertainty
 from lqrsim.errors import (
-    LONGEST,
     InputError,
     check_array,
     check_count,
@@ -52,16 +52,6 @@ api: Any = import_module("robustness.api")
 of_runs: Any = import_module("robustness.of_runs")
 subjects: Any = import_module("robustness.subjects")
 lq: Any = ls  # whose types nobody checks
-
-
-def refusal(call: Callable[[], object]) -> str:
-    """The one line with which a call is refused."""
-    with pytest.raises(InputError) as caught:
-        call()
-    line = str(caught.value)
-    assert len(line.splitlines()) == 1
-    assert len(line) <= LONGEST
-    return line
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusing import error_line
 
 import lqrsim as ls
 import lqrsim.gym
@@ -186,9 +187,7 @@ def test_what_cannot_be_begun_with_is_one_line(
         ls.save(ls.OffsetFree(scenario.problem, plan, calm).policy, left / "filter.npz")
     out = tmp_path / "out"
     assert main(["solve", *words.format(left=left, own=own).split(), "--out", str(out)]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("lqrsim: error: ")
-    assert error.count("\n") == 1
+    error = error_line(capsys)
     assert all(part in error for part in says), error
     assert not out.exists()
 

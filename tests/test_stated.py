@@ -6,6 +6,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from refusing import error_line
 from sampling import is_short
 
 import lqrsim as ls
@@ -290,9 +291,7 @@ def test_commands_that_make_no_sense_are_refused(
     options: str, line: str, solved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["simulate", str(solved), "--out", str(tmp_path), *options.split()]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith(f"lqrsim: error: {line}")
-    assert said.count("\n") == 1
+    assert error_line(capsys).startswith(f"lqrsim: error: {line}")
 
 
 def test_view_takes_a_controller_for_live_runs_only(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:
