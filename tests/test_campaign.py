@@ -884,7 +884,7 @@ def test_what_was_read_does_not_hide_what_is_written_later(reference: Results, t
     part = Results(folder)
 
     def done() -> list[int]:
-        return [so_far.ends.total() for so_far in part.cell_summaries().values()]
+        return [so_far.tally.total() for so_far in part.cell_summaries().values()]
 
     assert done() == [4, 6]
     for path in later.iterdir():

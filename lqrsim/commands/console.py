@@ -149,9 +149,9 @@ def of_campaign(results: "ls.stress.Results") -> Object:
 
     cells = []
     for cell, so_far in results.cell_summaries().items():
-        row = {**_fields(cell, "policy sweep strength"), "trials": so_far.ends.total()}
+        row = {**_fields(cell, "policy sweep strength"), "trials": so_far.tally.total()}
         if (success := so_far.success) is not None:
-            outcomes = {name: so_far.ends[name] for name in OUTCOMES}
+            outcomes = {name: so_far.tally[name] for name in OUTCOMES}
             row |= {"outcomes": outcomes, "reached": success.exact, "deterministic": success.alike}
         cells.append(row)
     return {

@@ -83,7 +83,7 @@ class Stress(SetupOptions):
         console.say(f"\nnext:\n  {results.command_of('report')}")
         if console.wants_result():
             console.result(campaign=console.of_campaign(results))
-        return 1 if any(so_far.ends["error"] for so_far in results.cell_summaries().values()) else 0
+        return 1 if any(so_far.tally["error"] for so_far in results.cell_summaries().values()) else 0
 
 
 OwnScenario = Annotated[

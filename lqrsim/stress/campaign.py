@@ -169,7 +169,7 @@ def run_campaign(
             done += shard.count
             tell(done, total)
         for cell, so_far in results.cell_summaries().items():
-            if (counted := so_far.ends.total()) != campaign.trials:
+            if (counted := so_far.tally.total()) != campaign.trials:
                 raise InputError(f"folder: got {counted} trials of {cell}, want {campaign.trials}: {results.command}")
     return results
 

@@ -66,7 +66,7 @@ class CellSummary:
     """What the trials of a cell say so far, by the shards that it has: small, unlike their rows."""
 
     shards: list[Shard]
-    ends: Counter[str]  # the number of trials of each outcome
+    tally: Counter[str]  # the number of trials of each outcome
     reasons: Counter[str]  # the number of trials that each reason stopped
     success: analysis.Success | None  # None if no trial has been run
 
@@ -91,7 +91,7 @@ class Results:
         self.manifest = read_manifest(self.folder)
         self.cells = self.manifest.settings.cells
         self._scenario = scenario
-        self._known, self._solutions = dict[Cell, CellSummary](), dict[str, Solution]()
+        self._summaries, self._solutions = dict[Cell, CellSummary](), dict[str, Solution]()
         reference = self.manifest.settings.scenario
         if scenario is not None:
             named, known = (os.path.normpath(from_anywhere(text)) for text in (scenario, reference))
@@ -133,7 +133,7 @@ class Results:
         deterministic = not cell.strength or [cell.sweep, cell.strength] in self.manifest.deterministic
         found = Outcomes(**columns, deterministic=deterministic)
         reasons = Counter(reason for table in tables for reason in table["reason"].tolist() if reason)
-        self._known[cell] = CellSummary(shards, Counter(found.outcome.tolist()), reasons, found.success)
+        self._summaries[cell] = CellSummary(shards, Counter(found.outcome.tolist()), reasons, found.success)
         return found
 
     def tally(self, cell: Cell, *, partial: bool = False) -> Counter[str]:
@@ -144,10 +144,10 @@ class Results:
         """The summary of each cell. Shards never change, so they are read again only if there are others."""
         for cell in self.cells:
             if not (shards := self._to_read(cell, partial=True)):
-                self._known[cell] = CellSummary([], Counter(), Counter(), None)
-            elif cell not in self._known or self._known[cell].shards != shards:
+                self._summaries[cell] = CellSummary([], Counter(), Counter(), None)
+            elif cell not in self._summaries or self._summaries[cell].shards != shards:
                 self.outcomes(cell, partial=True)
-        return {cell: self._known[cell] for cell in self.cells}
+        return {cell: self._summaries[cell] for cell in self.cells}
 
     def summary(self) -> str:
         """A line per cell with success rate, interval and outcomes; then where the plans end, and errors."""
@@ -164,7 +164,7 @@ class Results:
             rate = f"{100 * exact.value:5.1f} [{100 * exact.low:5.1f}, {100 * exact.high:5.1f}]"
             rate = f"{reached:>13} {'deterministic: 1 run' if success.alike else rate}"
             line = f"{cell.sweep:<{width}} {cell.strength:>8g} {cell.policy:<{wide}} {rate:>33}"
-            lines.append(line + "".join(f" {so_far.ends[name]:>9}" for name in others))
+            lines.append(line + "".join(f" {so_far.tally[name]:>9}" for name in others))
         lines += [self.manifest.left_out] if self.manifest.left_out else []
         designs = (f"{policy}: {text}" for policy, text in self.designs().items())
         lines += [*self.manifest.remarks, *designs, *self.plans()]
@@ -185,7 +185,7 @@ class Results:
             if (success := so_far.success) is not None:
                 interval = (None, None) if success.alike else (success.exact.low, success.exact.high)
                 rate = (success.exact.value, *interval)
-            counts = (so_far.ends.total(), *(so_far.ends[name] for name in OUTCOMES))
+            counts = (so_far.tally.total(), *(so_far.tally[name] for name in OUTCOMES))
             rows.append((cell.sweep, cell.strength, cell.policy, *counts, *rate))
         settings = self.manifest.settings
         notes = [
@@ -230,8 +230,8 @@ class Results:
         """
         reached: Counter[str] = Counter()
         for cell, so_far in self.cell_summaries().items():
-            if cell.strength > 0 and so_far.ends["error"] < so_far.ends.total():
-                reached[cell.sweep] += so_far.ends["reached"]
+            if cell.strength > 0 and so_far.tally["error"] < so_far.tally.total():
+                reached[cell.sweep] += so_far.tally["reached"]
         sweeps = self.manifest.campaign["sweeps"]
         kinds = {name: [f"{name}:{item['kind']}" for item in sweeps[name]] for name in reached if name in PRESETS}
         return [
