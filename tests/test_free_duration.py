@@ -21,7 +21,7 @@ import lqrsim.gym
 from lqrsim import cli
 from lqrsim.results.solution_parts import Status
 from lqrsim.scenarios.references import resolve
-from lqrsim.solvers import budget, free_duration, smoother
+from lqrsim.solvers import budget, free_duration, smoother, strategy
 from lqrsim.solvers.settings import SmootherSettings
 
 
@@ -240,7 +240,7 @@ def test_seconds_of_an_iteration_are_its_own(monkeypatch: pytest.MonkeyPatch) ->
 
     def solve(fixed: ls.Problem, settings: SmootherSettings) -> ls.Solution:
         now[0] += 100.0
-        return smoother.solve_fixed(fixed, settings, stop)
+        return strategy.Search(fixed, settings, stop).solve()
 
     solution = free_duration.solve_for_duration(problem(), SmootherSettings(), solve, stop)
     assert solution.status is Status.CONVERGED

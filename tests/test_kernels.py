@@ -556,7 +556,7 @@ class Begun:
     def ilqr(self, first: int, last: int, task: int = declarations.ITERATE, **memory: float) -> tuple[Any, ...]:
         for name, number in memory.items():
             self.work.memory[name] = number
-        given = self.run._plan_arguments(task, NO_DESCENT, self.run.final, 0.0, first, last, self.log)
+        given = self.run._plan_arguments(task, NO_DESCENT, self.run.method.tolerance, 0.0, first, last, self.log)
         return replay(self.source, self.sizes, "ilqr", *with_rows(given))
 
     def linearize(self) -> tuple[Any, ...]:
@@ -566,7 +566,7 @@ class Begun:
 
 def steps_of(run: SolveRun, how: Descent, first: int, last: int, log: StructuredArray) -> tuple[Any, ...]:
     """Arguments for steps from the plan."""
-    tolerance = run.final if how is NEWTON_STEPS else run.rough
+    tolerance = run.method.tolerance if how is NEWTON_STEPS else run.method.rough
     return run._plan_arguments(declarations.DESCEND, how, tolerance, 0.0, first, last, log)
 
 

@@ -136,7 +136,7 @@ def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool, 
             break
         # From the optimum without constraints they soon settle or cycle. If they cycle, damped iterations are much
         # faster.
-        off = max(last.gap / most, last.violation / run.allowed)
+        off = max(last.gap / most, last.violation / run.method.violation)
         stale = 0 if off < CLOSER * nearest else stale + 1
         nearest = min(off, nearest)
         if stale == patience and not known and run.settings.safeguard:
@@ -185,7 +185,7 @@ def damped_to_end(run: SolveRun) -> RunResult:
     if not np.isfinite(optimality):
         return certified(run, run.run_to_end())
     if not run.problem.constraints:
-        if not run.second_order:
+        if not run.method.exact:
             damped = run.damped()
         else:
             with run.budget.limited(REFINED):
@@ -263,7 +263,7 @@ class AugmentedLagrangian:
 
     def __init__(self, run: SolveRun) -> None:
         self._problem, self._work, self._constraints = run.problem, run.work, run.work.multipliers
-        self._allowed = tolerance = run.allowed
+        self._allowed = tolerance = run.method.violation
         # The tolerances of inequalities and of equalities, if there are any.
         terms = run.problem.constraint_terms
         self._tolerance = {term.equality: allowed_violation(term, tolerance) or tolerance for term in terms}

@@ -180,7 +180,7 @@ def solve_between_knots(
     `solve` solves a problem that is to be right at its knots, within the time of `stop`. With a free duration, its
     search goes on from the plan `begin` from the second round on.
     """
-    at_knots, tolerance = replace(problem, accuracy=None, between_knots=False), settings.violation_tolerance(problem)
+    at_knots, tolerance = replace(problem, accuracy=None, between_knots=False), settings.method(problem).violation
     accuracy = problem.accuracy or np.inf
     rows = [
         WithinPeriods(constraint, np.zeros((problem.steps, term.rows)), np.zeros(term.rows))

@@ -24,7 +24,6 @@ from lqrsim.kernels.records import CERTIFICATE, CostToGo, Motion
 from lqrsim.problem.problem import FixedState
 from lqrsim.results.solution_parts import Certificate, Curvature, Status
 from lqrsim.solvers.engine import RunResult, SolveRun, no_value
-from lqrsim.solvers.settings import has_curvature
 from lqrsim.solvers.stages import Stages
 
 # Tolerances for rounding: of the residuals of policy and dynamics, and of the cost, relative to it. A policy's control
@@ -67,7 +66,7 @@ def certified(run: SolveRun, result: RunResult) -> RunResult:
     if value is None:
         certificate = replace(certificate, optimality=np.inf)
     if result.success:
-        tolerance = run.final if result.status is Status.CONVERGED else None
+        tolerance = run.method.tolerance if result.status is Status.CONVERGED else None
         if tolerance is not None and not certificate.optimality < SLACK * tolerance:
             # If controls are at their limits, the Hessians of the Riccati pass are not the Hessians of the policy.
             evaluated, _ = certificate_of(run, declarations.EVALUATE, result, no_value(result.states), violation)
@@ -125,8 +124,7 @@ def curvature_of(run: SolveRun, result: RunResult) -> tuple[Curvature, Motion | 
     At a saddle also a direction of negative curvature, scaled to the typical sizes.
     """
     problem = run.problem
-    exact = run.second_order and has_curvature(problem) and problem.noise_term is None
-    if not (result.status is Status.CONVERGED and exact):
+    if result.status is not Status.CONVERGED or not run.method.curved or problem.noise_term is not None:
         return Curvature.NOT_CHECKED, None
     if not problem.constraints:
         out = np.zeros(1, CERTIFICATE)

@@ -414,7 +414,7 @@ def keep_modes(run: SolveRun, result: RunResult) -> RunResult | None:
     modes.check_time = check_time
     descent = None
     try:
-        descent = Descent(problem, modes, plan, run.final, run.budget)
+        descent = Descent(problem, modes, plan, run.method.tolerance, run.budget)
         return with_certificate(run, modes, descent, descent.run())
     except TimeoutError:
         if descent is None or descent.plan is plan:
@@ -434,8 +434,8 @@ def with_certificate(run: SolveRun, modes: ContactModes, descent: Descent, statu
     certificate = replace(certificate, optimality=optimality, contacts=contacts)
     detail = f"within its contact modes, against {contacts.pressed} switches"
     if status is Status.CONVERGED:
-        wrong = faults(certificate, claimed=plan.cost, rounding=0.0, tolerance=run.final)
-        if max(contacts.across, contacts.sampled) > run.final:
+        wrong = faults(certificate, claimed=plan.cost, rounding=0.0, tolerance=run.method.tolerance)
+        if max(contacts.across, contacts.sampled) > run.method.tolerance:
             wrong = f"{wrong}, a plan beside it is cheaper".removeprefix(", ")
         if wrong:
             status, detail = Status.STALLED, f"{detail}; {wrong}"

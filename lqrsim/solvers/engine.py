@@ -32,7 +32,7 @@ from lqrsim.results.solution_parts import (
 )
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import ATTENTION, Budget, in_slices
-from lqrsim.solvers.settings import INSIDE, InitialGuess, SmootherSettings, has_curvature
+from lqrsim.solvers.settings import INSIDE, InitialGuess, Method, SmootherSettings
 from lqrsim.solvers.stages import Pool, Stages
 
 _METHODS = {getattr(declarations, name): name.lower() for name in ("SMOOTH", "DAMPED", "REJECTED", "ILQR", "NEWTON")}
@@ -183,8 +183,7 @@ class SolveRun:
     Attributes:
       initial_guess: the start. work: the memory. budget: the iterations and the time.
       ending: the state of smoothing or iLQR; the outcome is RUNNING until it has ended.
-      second_order: whether Newton's method, or with constraints the interior point, ends the solve. final, rough: the
-        tolerances of the answer, and of the smoothing before it; allowed: that of constraints; see `SmootherSettings`.
+      method: what ends the solve, and with which tolerances.
     """
 
     def __init__(
@@ -197,15 +196,13 @@ class SolveRun:
         self.problem, self.settings, self.initial_guess, self.budget = problem, settings, initial_guess, budget
         kind = entry, compiled.core(problem, settings.form), problem.steps
         self.work = _pool.take(lambda idle: idle.kind == kind) or Workspace(problem, settings.form, entry)
-        self.work.begin(problem, settings, initial_guess, start)
+        self.method = settings.method(problem)
+        self.work.begin(problem, settings, self.method, initial_guess, start)
         self._stages: Stages | None = None
         self._rows, self._row = np.zeros(max(budget.left, 1), LOG), 0  # rows of smoothing, and the next row
         self._last: Iteration | None = None  # the last iteration of smoothing
         self.ending = Ending(declarations.RUNNING)
-        self.second_order = settings.second_order(problem)
-        self.final, self.rough = settings.final(problem), settings.rough(problem)
-        self.allowed = settings.violation_tolerance(problem)
-        self._valley = VALLEY if self.second_order and has_curvature(problem) else 0.0
+        self._valley = VALLEY if self.method.curved else 0.0
         # Fractions of the obstacle costs in the iterations; the last fraction holds for all later iterations.
         self._fractions = (*(initial_guess.prior.obstacles if initial_guess.prior is not None else ()), 1.0)
         self._loop = self.work.compiled_call(self.work.core, entry, *self._arguments(0, 0, self._rows))
@@ -251,7 +248,7 @@ class SolveRun:
         ending = self.checked_ending()
         lost = ending is not self.ending  # a function is not finite at the start, so nothing can help
         result = self.result(ending)
-        if lost or (result.success and not self.second_order):
+        if lost or (result.success and not self.method.exact):
             return result
         if ending.outcome == declarations.TIMED_OUT or (self.settings.safeguard and not self.budget.left):
             return self.best(result) if return_best else result
@@ -306,7 +303,7 @@ class SolveRun:
 
     def newton(self, *, detail: str = "", added: float = 0.0, least: float = 0.0, patient: bool = False) -> RunResult:
         """Newton's method from the best plan so far; if no other method can follow, with short steps too."""
-        ending = self.descend(NEWTON_STEPS._replace(patient=patient), self.final, added=added, least=least)
+        ending = self.descend(NEWTON_STEPS._replace(patient=patient), self.method.tolerance, added=added, least=least)
         status = ending.status
         if ending.outcome == declarations.STALLED:
             detail = joined(detail, "Newton's method makes no progress")
@@ -318,9 +315,9 @@ class SolveRun:
         """Damped iterations from the best plan so far, after smoothing failed."""
         work, detail = self.work, f"the undamped method failed ({result.detail or result.status.meaning})"
         damped = None
-        for least in ((NEARLY, NEAR), (0.0, 0.0)) if self.second_order else ((0.0, 0.0),):
+        for least in ((NEARLY, NEAR), (0.0, 0.0)) if self.method.exact else ((0.0, 0.0),):
             damped = self.damped(least=least)
-            if not (self.second_order and damped.success) or self.budget.over:
+            if not (self.method.exact and damped.success) or self.budget.over:
                 break
             result = self.newton(detail=detail, patient=True)
             if result.success or self.budget.over:
@@ -330,9 +327,9 @@ class SolveRun:
             # Nothing helps: report the failure.
             given_up = result.status in (Status.MAX_ITERATIONS, Status.STALLED)
             return replace(result, status=Status.DIVERGED if given_up else result.status, detail=detail, values={})
-        if self.second_order and damped.success:
+        if self.method.exact and damped.success:
             return result
-        if self.second_order and not self.budget.over:
+        if self.method.exact and not self.budget.over:
             # Newton's passes are about the plan, and need no inverse of the controls' weights.
             return self.newton(detail=detail, patient=True)
         status = damped.status
@@ -346,7 +343,7 @@ class SolveRun:
 
     def damped(self, *, added: float = 0.0, least: tuple[float, float] = (0.0, 0.0)) -> Ending:
         """Damped iterations from the best plan so far, with tolerances of cost and gap of at least `least`."""
-        return self.descend(DAMPED_STEPS, max(self.rough, least[0]), least[1], added=added)
+        return self.descend(DAMPED_STEPS, max(self.method.rough, least[0]), least[1], added=added)
 
     def descend(
         self, how: Descent, tolerance: float, gap_tolerance: float = 0.0, *, added: float = 0.0, least: float = 0.0
@@ -358,7 +355,7 @@ class SolveRun:
 
     def ilqr(self) -> Ending:
         """Iterations of iLQR, from the rollout of the first policy; with the entry "ilqr". The ending is checked."""
-        arguments = partial(self._plan_arguments, declarations.ITERATE, records.NO_DESCENT, self.final, 0.0)
+        arguments = partial(self._plan_arguments, declarations.ITERATE, records.NO_DESCENT, self.method.tolerance, 0.0)
         self.ending, self._row = self._iterate(arguments, self.work.best, self._rows), len(self.budget.log)
         return self.checked_ending()
 
@@ -552,7 +549,7 @@ class SolveRun:
 
     def _arguments(self, first: int, last: int, rows: StructuredArray, *, again: bool = False) -> LoopCall:
         """Arguments of the loop for iterations from `first` up to `last`; one at a time during a homotopy."""
-        work, tolerance, valley = self.work, self.rough, 0.0 if again else self._valley
+        work, tolerance, valley = self.work, self.method.rough, 0.0 if again else self._valley
         fraction = 1.0 if again else self._fractions[min(first, len(self._fractions) - 1)]
         if fraction != 1:
             last = min(last, first + 1)
@@ -574,12 +571,12 @@ class SolveRun:
         return self._stated(task, first, last, rows, tolerance, options, prior=self.work.no_prior, last=self.work.trial)
 
     def _linearize_arguments(self, rows: StructuredArray) -> LoopCall:
-        return self._plan_arguments(declarations.LINEARIZE, DAMPED_STEPS, self.rough, 0.0, 0, 0, rows)
+        return self._plan_arguments(declarations.LINEARIZE, DAMPED_STEPS, self.method.rough, 0.0, 0, 0, rows)
 
     def _check_arguments(self, task: int, result: RunResult, to_go: CostToGo, certificate: StructuredArray) -> LoopCall:
         """Arguments for certifying a plan and its policy with this cost-to-go."""
         return self._stated(
-            task, 0, 0, self._rows, self.final, {}, to_go=to_go, last=result.plan, last_policy=result.law,
+            task, 0, 0, self._rows, self.method.tolerance, {}, to_go=to_go, last=result.plan, last_policy=result.law,
             certificate=certificate,
         )  # fmt: skip
 
@@ -629,23 +626,25 @@ class Workspace:
             self._calls[name] = module.lay_out(name, *arguments)
         return self._calls[name]
 
-    def begin(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
+    def begin(
+        self, problem: Problem, settings: SmootherSettings, method: Method, initial_guess: InitialGuess, start: Array
+    ) -> None:
         """Begin a solve. The memory may have served another solve of the same size and number of steps."""
-        self._problem, self._tolerance, steps = problem, settings.violation_tolerance(problem), problem.steps
-        self._exact, self.priced = settings.second_order(problem), np.isfinite(settings.price)
+        self._problem, self._method, steps = problem, method, problem.steps
+        self.priced = np.isfinite(settings.price)
         self.fixed = isinstance(problem.initial, FixedState)
         self.prior, self.prior_iterations = self.no_prior, 0
         if initial_guess.prior is not None:
             about = np.broadcast_to(initial_guess.prior.about, (steps + 1, len(start))).copy()
             self.prior = Prior(initial_guess.prior.weight.copy(), about)
             self.prior_iterations = initial_guess.prior.iterations
-        spare = INSIDE * self._tolerance if self._exact else self._tolerance
+        spare = INSIDE * method.violation if method.exact else method.violation
         self.multipliers = [
             compiled.ConstraintMultipliers(problem, term, spare, settings.price) for term in problem.constraint_terms
         ]
         for multipliers, known in zip(self.multipliers, initial_guess.multipliers, strict=False):
             multipliers.penalty, multipliers.values[...] = known.penalty, known.values.ravel()
-        self.model = compiled.compile_problem(problem, multipliers=self.multipliers, second_order=self._exact)
+        self.model = compiled.compile_problem(problem, multipliers=self.multipliers, second_order=method.exact)
         arrays = self.arrays = self.arrays._replace(homotopy_scaled=self.model.stage, prior=self.prior)
         # All other memory is written before it is read.
         self.memory_rows[...] = 0.0
@@ -748,7 +747,7 @@ class Workspace:
 
     def keeps(self, values: list[Array]) -> bool:
         """Whether a plan with these values keeps all constraints within their tolerance, or at their price."""
-        allowed = partial(allowed_violation, tolerance=self._tolerance, spared=not self._exact)
+        allowed = partial(allowed_violation, tolerance=self._method.violation, spared=not self._method.exact)
         pairs = zip((multipliers.term for multipliers in self.multipliers), values, strict=True)
         return self.priced or all(violation_of(term, numbers) <= allowed(term) for term, numbers in pairs)
 

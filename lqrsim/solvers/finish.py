@@ -29,7 +29,6 @@ from lqrsim.solvers.augmented_lagrangian import AugmentedLagrangian, by_multipli
 from lqrsim.solvers.budget import Laps
 from lqrsim.solvers.certify import certified
 from lqrsim.solvers.engine import RunResult, SolveRun, copied
-from lqrsim.solvers.settings import has_curvature
 from lqrsim.solvers.stages import NAME, STRONG, WEAK, Barrier, InteriorPoint, InteriorResult, Measures, Sizes, restore
 
 OPENING = 6  # iterations of smoothing before constraints, or limits that controls press against, act
@@ -79,7 +78,7 @@ class Known:
 
 def finish(run: SolveRun, known: Known) -> RunResult:
     """Run from one start to the end; certified. `known` has the results of other runs of the same problem."""
-    if run.initial_guess.interior is not None or (run.problem.constraints and run.second_order):
+    if run.initial_guess.interior is not None or (run.problem.constraints and run.method.exact):
         return ConstrainedRun(run, known).run_to_end()
     if not run.problem.constraints:
         return certified(run, _without_constraints(run))
@@ -92,7 +91,7 @@ def finish(run: SolveRun, known: Known) -> RunResult:
 
 def refine(run: SolveRun, known: Known) -> RunResult:
     """Run to the end from the rollout of the first policy, on the same side of the obstacles; certified."""
-    if run.problem.constraints and run.second_order:
+    if run.problem.constraints and run.method.exact:
         return ConstrainedRun(run, known, stay=True).run_to_end()
     result = damped_to_end(run)
     if not result.stuck:
@@ -130,7 +129,7 @@ def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult
 def _without_constraints(run: SolveRun) -> RunResult:
     """Smoothing and Newton's method. The interior point if controls stay at their limits, or all else fails."""
     problem, budget, space, point = run.problem, run.budget, run.problem.control_coordinates, InteriorRun(run)
-    if not run.second_order or problem.noise_term is not None or not np.isfinite([space.low, space.high]).any():
+    if not run.method.exact or problem.noise_term is not None or not np.isfinite([space.low, space.high]).any():
         return run.run_to_end()
     run.smooth(OPENING)
     controls = run.work.best.controls
@@ -162,8 +161,8 @@ class InteriorRun:
     _flat: RunResult | None = None  # the last result where the cost no longer changed
 
     def __init__(self, run: SolveRun) -> None:
-        self._run, self._problem, self._budget, self._allowed = run, run.problem, run.budget, run.allowed
-        self._curved = has_curvature(run.problem)
+        self._run, self._problem, self._budget, self._allowed = run, run.problem, run.budget, run.method.violation
+        self._curved = run.method.curved
 
     def run_from(
         self, plan: Motion, barrier: Barrier, *, multipliers: tuple[Array, ...] = (), stale: int | None = None
@@ -183,8 +182,8 @@ class InteriorRun:
         with budget.stop.heeding():
             point = InteriorPoint(run.stages, plan, barrier, price=run.settings.price, multipliers=multipliers)
             result = point.run(
-                tolerance=run.final, violation=self._allowed, most=min(MOST, budget.left - 1), near=barrier is WEAK,
-                laps=Laps(budget), over=over, hurried=budget.hurried,
+                tolerance=run.method.tolerance, violation=self._allowed, most=min(MOST, budget.left - 1),
+                near=barrier is WEAK, laps=Laps(budget), over=over, hurried=budget.hurried,
             )  # fmt: skip
         return None if result is None else self.finished(result)
 
@@ -427,10 +426,11 @@ class ConstrainedRun(InteriorRun):
         best = best.kept()
         self.without_multipliers()
         run.work.set_best(best.plan, best.cost)
-        tolerance, run.final = run.final, run.settings.final(self._problem.with_constraints([]))
+        method, alone = run.method, run.settings.method(self._problem.with_constraints([]))
+        run.method = method._replace(tolerance=alone.tolerance)
         result = run.newton(detail=best.detail, patient=True)
         if not result.success or result.violation > 0:
-            run.final = tolerance
+            run.method = method
             return None
         return replace(result, multipliers=())
 
@@ -609,7 +609,7 @@ def _violation_slopes(
     the violated rows alone; and the rows in words, each with its fraction.
     """
     problem, work, states, controls = run.problem, run.work, plan.states, plan.controls
-    allowed = run.allowed
+    allowed = run.method.violation
     steps, joint = len(controls), states.shape[1] + controls.shape[1]
     slopes, alone, missed = np.zeros((steps + 1, joint)), np.zeros((steps + 1, joint)), 0.0
     holding: list[tuple[float, str]] = []

@@ -72,7 +72,7 @@ def solve_for_duration(
         search.grow_trees()
     if settings.safeguard:
         search.try_longest()
-    return stop.finish(search.solution())
+    return search.solution()
 
 
 class DurationSearch:
@@ -250,7 +250,8 @@ class DurationSearch:
 
         The iterations join the log of the budget, which may end the search.
         """
-        before, problem, tolerance = len(budget.log), self._problem, fraction * self._settings.final(self._problem)
+        before, problem = len(budget.log), self._problem
+        tolerance = fraction * self._settings.method(problem).tolerance
         budget.report()
         with self._stop.reporting("smooth"):
             by_segment = self._with_timed_segments(begin, budget) if problem.segments else None
@@ -281,7 +282,7 @@ class DurationSearch:
 
         With `hold`, the gaps of the plan are first closed with its duration, which must be that of the problem.
         """
-        n, violation = len(problem.dynamics.state_coordinates), self._settings.violation_tolerance(problem)
+        n, violation = len(problem.dynamics.state_coordinates), self._settings.method(problem).violation
         with self._stop.not_counting():  # compiling
             stages = Stages(with_duration_state(problem, by_segment=bool(segments)))
         stages.about.jumps[list(segments)] = 1.0  # the last state may jump there, each after the first
@@ -317,7 +318,7 @@ class DurationSearch:
         """
         problem = self._problem
         _, _, result = self._searched(problem, begin, budget, tolerance=NEAR_SEGMENTS, segments=problem.segments)
-        allowed, measures = self._settings.violation_tolerance(problem), result.measures
+        allowed, measures = self._settings.method(problem).violation, result.measures
         if not (result.solved or (measures.violation <= allowed and measures.gap < NEAR_SEGMENTS)):
             return None
         steps, old = problem.steps, np.array([0, *problem.segments, problem.steps])

@@ -74,10 +74,10 @@ def prepare(
         constraint_tolerance=constraint_tolerance, finish=finish,
     )  # fmt: skip
     solved = problem if problem.control_rate is None else with_last_command(problem)
-    if tolerance is None and solved.constraints and settings.second_order(solved):
+    if tolerance is None and solved.constraints and settings.method(solved).exact:
         if _can_yield(solved):
             settings = replace(settings, tolerance=COARSE)
-        elif settings.final(solved) == FINE:
+        elif settings.method(solved).tolerance == FINE:
             settings = replace(settings, tolerance=SLOPES)
     return PreparedSolver(problem, settings, check_threads(threads))
 
@@ -121,14 +121,14 @@ class PreparedSolver(OneVersion):
         run.work.constraint_values(run.work.best)
         for which in range(len(self.problem.constraint_terms)):
             run.work.constraint_slope(which, 0, state, guess.offset[0], 0)
-        if self.problem.constraints and run.second_order:
+        if self.problem.constraints and run.method.exact:
             stages, plan, best = run.stages, Motion(*run.work.best), _Best(run)
             _Finder(run, plan, best).find()
             if _can_yield(self.problem):
                 return
             # Another solve may need code that this solve did not need.
             sizes = stages.sizes(plan)
-            InteriorPoint(stages, plan).run(tolerance=run.final, violation=run.allowed, most=1)
+            InteriorPoint(stages, plan).run(tolerance=run.method.tolerance, violation=run.method.violation, most=1)
             restore(
                 stages,
                 plan,
@@ -203,7 +203,7 @@ class PreparedSolver(OneVersion):
         run = SolveRun(problem, self.settings, guess, problem._start_or_zero, budget)
         best = _Best(run)
         with problem.dynamics.solving(self.threads):
-            if problem.constraints and run.second_order:
+            if problem.constraints and run.method.exact:
                 finder = _Finder(run, _plan_of(planned, best), best, self._closing)
                 result, ended = finder.find(), finder.laps.ended
                 if finder.may_be_far:
@@ -316,17 +316,17 @@ class _Finder:
             detail = "the policy that it begins with diverges"
             return replace(self._best.result, status=Status.NOT_FINITE, detail=detail)
         known = tuple(multipliers.values for multipliers in run.initial_guess.multipliers)
-        active = ActiveSet(self._stages, self._plan, known, run.allowed)
+        active = ActiveSet(self._stages, self._plan, known, run.method.violation)
         self.laps.ended = time.perf_counter()
         solved = self._take_steps(active)
         if not (solved or active.hopeless or self._late(BEGINNING * active.model_seconds)) and budget.left:
             point = InteriorPoint(self._stages, copied(self._best.result), WEAK, multipliers=known)
             result = point.run(
-                tolerance=run.final, violation=run.allowed, most=budget.left, laps=self.laps,
+                tolerance=run.method.tolerance, violation=run.method.violation, most=budget.left, laps=self.laps,
                 over=lambda _, seconds: self._late(seconds) or not budget.left,
             )  # fmt: skip
             if result.solved or not np.isfinite(active.measures.cost):
-                active = ActiveSet(self._stages, result.plan, result.multipliers, run.allowed)
+                active = ActiveSet(self._stages, result.plan, result.multipliers, run.method.violation)
                 solved = self._take_steps(active)
         self.laps.ended = time.perf_counter()
         in_time = self.laps.ended + ELSEWHERE * active.model_seconds + self._closing < budget.stop.deadline
@@ -335,7 +335,7 @@ class _Finder:
             return replace(self._best.result, status=self._unsolved, detail=raised_by(functions_of(run.problem)))
         plan, gain, cost, values = active.carried_out()
         for term, numbers in zip(run.problem.constraint_terms, values, strict=True):
-            solved = solved and violation_of(term, numbers) <= allowed_violation(term, run.allowed)
+            solved = solved and violation_of(term, numbers) <= allowed_violation(term, run.method.violation)
         detail = "no plan near it keeps the constraints" if active.hopeless and not solved else ""
         return RunResult(
             status=Status.CONVERGED if solved else self._unsolved, detail=detail, plan=plan,
@@ -350,7 +350,7 @@ class _Finder:
             measures.record(self.laps, "active set")
             return self._late(active.model_seconds) or not self._budget.left
 
-        return active.run(self._run.final, watch, self._late)
+        return active.run(self._run.method.tolerance, watch, self._late)
 
     def _giving_way(self) -> RunResult:
         """The plan if constraints give way that the robot keeps by itself: limits of forces, which MuJoCo clips. It is
@@ -379,7 +379,7 @@ class _Finder:
             values, missed = stages.values(plan), 0.0
             for term, numbers in zip(terms, run.work.constraint_values(plan), strict=True):
                 if not term.yields:
-                    missed = max(missed, violation_of(term, numbers) - allowed_violation(term, run.allowed))
+                    missed = max(missed, violation_of(term, numbers) - allowed_violation(term, run.method.violation))
             short = np.where(stages.live & yields, np.maximum(-values, 0.0), 0.0)
             paid = float((short * np.where(yields, prices, 0.0)).sum())
             return not np.isfinite(plan.states).all(), missed, cost + paid
@@ -390,7 +390,7 @@ class _Finder:
         if self._late(model_seconds) or not budget.left:
             return replace(self._best.result, status=self._unsolved)
         result = point.run(
-            tolerance=run.final, violation=run.allowed, most=budget.left, laps=self.laps,
+            tolerance=run.method.tolerance, violation=run.method.violation, most=budget.left, laps=self.laps,
             over=lambda _, seconds: self._late(model_seconds + seconds),  # the next may compute derivatives anew
         )  # fmt: skip
         law = compiled.law_about(*result.plan, result.gain.copy())
@@ -402,7 +402,7 @@ class _Finder:
             return replace(self._best.result, status=self._unsolved)
         status = Status.CONVERGED if solved else self._unsolved
         violation, detail = run.work.violation_of(plan), ""
-        if violation > run.allowed:
+        if violation > run.method.violation:
             lagrangian = AugmentedLagrangian(run)
             lagrangian.evaluate(plan)
             detail = f"elastic: {lagrangian.worst()}"
@@ -437,14 +437,14 @@ class _Best:
         )  # fmt: skip
         self.before, self.improved = self.result.cost, False
         # Equalities are kept only within a tolerance.
-        allowed = run.allowed
+        allowed = run.method.violation
         self._none = max((allowed_violation(term, allowed) for term in run.problem.constraint_terms), default=0.0)
         self._negligible = min(allowed, EQUALITY_TOLERANCE)
         self._most = max(self.result.violation, self._none)
         self._copies: tuple[Array, ...] = ()
 
     def __call__(self, iteration: Iteration) -> None:
-        if iteration.optimality < self._run.final and iteration.violation == 0:
+        if iteration.optimality < self._run.method.tolerance and iteration.violation == 0:
             return  # probably the last one; `consider` sees it
         if iteration.method not in ("smooth", "newton"):
             return

@@ -5,7 +5,7 @@ A start is nothing, controls, a prior, a policy, a trajectory or another plan; `
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Annotated, TypeGuard
+from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
@@ -251,6 +251,16 @@ class Settings:
         return {field.name: getattr(self, field.name) for field in fields(self)} | {"start": start.summary}
 
 
+class Method(NamedTuple):
+    """What ends the solve of a problem, and with which tolerances."""
+
+    exact: bool  # Newton's method or, with constraints, the interior point; else smoothing and the augmented Lagrangian
+    curved: bool  # with second derivatives of the dynamics
+    tolerance: float  # of the answer
+    rough: float  # of the smoothing before it, coarser if another method follows
+    violation: float  # allowed of constraints, or the margin of inequalities at which the augmented Lagrangian aims
+
+
 @checked
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SmootherSettings(Settings):
@@ -273,27 +283,18 @@ class SmootherSettings(Settings):
         if self.penalty is not None and self.start is None:
             raise InputError(f"penalty: got {self.penalty:g} without a start, want start=... beside it")
 
-    def second_order(self, problem: Problem) -> bool:
-        """Whether Newton's method or the interior point ends a solve; with stop="cost" the paper's method does."""
-        return self.finish is not None and self.stop == "optimal" and can_be_exact(problem)
-
     @property
     def price(self) -> float:
         """Price of violating constraints, in cost per unit; infinite unless they are elastic."""
         return np.inf if self.elastic is None else self.elastic
 
-    def violation_tolerance(self, problem: Problem) -> float:
-        """Tolerance of constraints: the allowed violation, or the margin that the augmented Lagrangian aims at."""
-        return self.constraint_tolerance or (MISSED if self.second_order(problem) else SPARED)
-
-    def final(self, problem: Problem) -> float:
-        default = ROUGH if not self.second_order(problem) else FINE if has_curvature(problem) else LEARNED
-        return self.tolerance or default
-
-    def rough(self, problem: Problem) -> float:
-        """Tolerance at which smoothing ends, coarser if Newton's method follows."""
-        final = self.final(problem)
-        return max(final, ROUGH) if self.second_order(problem) else final
+    def method(self, problem: Problem) -> Method:
+        """How a problem is solved; with stop="cost" by the paper's method."""
+        exact = self.finish is not None and self.stop == "optimal" and can_be_exact(problem)
+        curved = exact and has_curvature(problem)
+        tolerance = self.tolerance or (FINE if curved else LEARNED if exact else ROUGH)
+        violation = self.constraint_tolerance or (MISSED if exact else SPARED)
+        return Method(exact, curved, tolerance, max(tolerance, ROUGH) if exact else tolerance, violation)
 
 
 def can_be_exact(problem: Problem) -> bool:

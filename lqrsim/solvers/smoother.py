@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import as_completed
 from dataclasses import fields, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -250,16 +250,16 @@ def _check_smooth(problem: Problem, settings: SmootherSettings) -> None:
             if got != want:
                 raise InputError(f"{option}: got {got!r} with control_rate, want {want!r}: no step leads back from it")
         problem = with_last_command(problem)  # its constraints have the limits of rates
-    if problem.between_knots and not (settings.second_order(problem) and settings.elastic is None):
+    if problem.between_knots and not (settings.method(problem).exact and settings.elastic is None):
         want = 'finish="newton" and stop="optimal", without elastic= and noise'
         raise InputError(f"between_knots: got True without an interior point that keeps all constraints, want {want}")
-    if settings.elastic is not None and not (problem.constraints and settings.second_order(problem)):
+    if settings.elastic is not None and not (problem.constraints and settings.method(problem).exact):
         if problem.constraints:
             noisy = settings.finish and settings.stop == "optimal"
             why = "with noise" if noisy else 'without finish="newton" and stop="optimal"'
             raise InputError(f"elastic: got {settings.elastic:g}, want None {why}")
         raise InputError(f"elastic: got {settings.elastic:g} for a problem without constraints, want None")
-    if problem.duration is not None and not settings.second_order(problem):
+    if problem.duration is not None and not settings.method(problem).exact:
         raise InputError('duration: got a free one without the interior point, want finish="newton" and stop="optimal"')
     starts = settings.starts or (STARTS if settings.start is None and problem.obstacle_costs else 1)
     check_memory("starts", starts, problem.steps * problem.bytes_per_step)
@@ -297,11 +297,16 @@ def _check_ilqr(problem: Problem, settings: Settings) -> None:
 
 
 def _solve_ilqr(problem: Problem, settings: Settings, stop: Stop | None = None) -> Solution:
-    if problem.control_rate is not None:
-        return solve_with_rates(problem, settings, partial(_solve_ilqr, stop=stop))
-    assert problem.start is not None
     stop = Stop() if stop is None else stop
     stop.begin(settings.time_limit)
+    solve_part: Callable[..., Solution] = partial(_iterate_ilqr, stop=stop)
+    if problem.control_rate is not None:
+        solve_part = partial(solve_with_rates, solve=solve_part)
+    return stop.finish(solve_part(problem, settings))
+
+
+def _iterate_ilqr(problem: Problem, settings: Settings, stop: Stop) -> Solution:
+    assert problem.start is not None
     budget = Budget(settings.max_iterations, stop)
     budget.report()
     with stop.not_counting():
@@ -331,15 +336,20 @@ def _solve_ilqr(problem: Problem, settings: Settings, stop: Stop | None = None) 
     result = certified(run, result)
     solution = assemble(run, result, solver="ilqr", options=settings.options(guess))
     run.give_back()
-    return stop.finish(solution)
+    return solution
 
 
 def solve(problem: Problem, settings: SmootherSettings, stop: Stop | None = None) -> Solution:
     """Solve one problem; the solution can look at its plan between the knots."""
     stop = Stop() if stop is None else stop
     stop.begin(settings.time_limit)
+
+    def solve_part(problem: Problem, settings: SmootherSettings, *, trees: bool = True) -> Solution:
+        return Search(problem, settings, stop).solve(trees=trees)
+
     # The loops that a problem needs, the innermost first: each solves problems with the one before.
-    solve_part: Callable[..., Solution] = partial(solve_fixed, stop=stop)
+    if any(constraint._rough for constraint in problem.constraints):
+        solve_part = partial(solve_refined, solve=solve_part, stop=stop)
     if problem.duration is not None:
         solve_part = partial(solve_for_duration, solve=partial(solve_part, trees=False), stop=stop)
     if problem.accuracy is not None or problem.between_knots:
@@ -349,84 +359,70 @@ def solve(problem: Problem, settings: SmootherSettings, stop: Stop | None = None
     solution = solve_part(problem, settings)
     substeps = solution.options.get("substeps")  # of dynamics whose single steps may be too coarse to look with
     seen = replace(problem, dynamics=problem.dynamics.with_substeps(substeps)) if isinstance(substeps, int) else problem
-    return solution._examined_by(partial(between_knots, seen, solution.trajectory))
+    return stop.finish(solution)._examined_by(partial(between_knots, seen, solution.trajectory))
 
 
-class _Round(NamedTuple):
-    """A problem that `solve_fixed` solves, and what may follow."""
+def solve_refined(
+    problem: Problem, settings: SmootherSettings, solve: Callable[..., Solution], stop: Stop, *, trees: bool = True
+) -> Solution:
+    """Solve a problem; refine constraints that the plan misses within periods, and solve again.
 
-    problem: Problem
-    settings: SmootherSettings
-    refinements: int = REFINEMENTS  # number of refinements of constraints that may follow
-    preliminary: bool = False  # whether its plan is to be refined once more, with the caller's settings
-    outlined: bool = False  # whether its constraints are refined along an outline
-
-
-def solve_fixed(problem: Problem, settings: SmootherSettings, stop: Stop, *, trees: bool = True) -> Solution:
-    """Solve a problem of fixed duration; refine constraints that the plan misses within periods, and solve again."""
-    now, log = _Round(problem, settings), tuple[Iteration, ...]()
-    if any(constraint._rough for constraint in problem.constraints):
-        outlined, rough, log = _outlined(problem, settings, stop)
-        now = _Round(outlined, rough, preliminary=rough is not settings, outlined=outlined is not problem)
+    With a start, the constraints are refined along the plan that follows from it. Without, they are at first refined
+    along an outline, which is the start of what follows if it does not keep them.
+    """
+    current, options, refinements, log = problem, _preliminary(problem, settings), REFINEMENTS, tuple[Iteration, ...]()
+    if settings.start is None:
+        outline, log = _outlined(problem, options, stop)
+        refined = problem._refined(outline) if outline.finite else None
+        if refined is None:
+            options = settings
+        else:
+            current = refined
+            options = replace(options, start=outline, starts=None) if settings.starts in (None, 1) else options
+    preliminary, outlined = options is not settings, current is not problem
     while True:
-        solution = Search(now.problem, now.settings, stop).solve(trees=trees)
+        solution = solve(current, options, trees=trees)
         if log:
             solution = replace(solution, iterations=(*log, *solution.iterations))
-        following = None if stop.due else _following(now, solution, problem, settings, stop)
-        if following is None:
-            return stop.finish(solution)
-        now, log = following, solution.iterations
+        log = solution.iterations
+        failed = solution.status in (Status.INFEASIBLE, Status.STALLED) and solution.trajectory.finite
+        if stop.due or not (solution.success or (failed and outlined)):
+            return solution
+        if failed:  # no plan may keep the constraints as they are along the outline
+            options = _preliminary(problem, replace(settings, start=solution.trajectory, starts=None))
+            current, outlined = problem, False
+            continue
+        refined = current._refined(solution.trajectory) if refinements else None
+        allowed = settings.method(current).violation
+        settled = solution.status is Status.COST_CONVERGED and solution.violation <= allowed
+        if refined is None and (settled or not preliminary):
+            return solution
+        current, options = refined or current, replace(settings, start=solution, starts=None)
+        refinements, preliminary, outlined = refinements - 1, False, False
 
 
-def _following(
-    now: _Round, solution: Solution, stated: Problem, original: SmootherSettings, stop: Stop
-) -> _Round | None:
-    """What to solve after a solution of the stated problem with the original settings; None if it is the answer."""
-    failed = solution.status in (Status.INFEASIBLE, Status.STALLED) and solution.trajectory.finite
-    if failed and now.outlined:  # no plan may keep the constraints as they are along the outline
-        problem, settings, _ = _outlined(stated, replace(original, start=solution.trajectory, starts=None), stop)
-        return now._replace(problem=problem, settings=settings, outlined=False)
-    if not solution.success:
-        return None
-    again = replace(original, start=solution, starts=None)
-    if now.refinements and (refined := now.problem._refined(solution.trajectory)) is not None:
-        return _Round(refined, again, now.refinements - 1)
-    allowed = original.violation_tolerance(now.problem)
-    settled = solution.status is Status.COST_CONVERGED and solution.violation <= allowed
-    if now.preliminary and not settled:
-        return _Round(now.problem, again, now.refinements - 1)
-    return None
+def _preliminary(problem: Problem, settings: SmootherSettings) -> SmootherSettings:
+    """The settings for a plan along which constraints are to be refined once more."""
+    method = settings.method(problem)
+    if not method.exact:
+        return settings
+    missed = max(method.violation, min(constraint._rough for constraint in problem.constraints))
+    return replace(settings, tolerance=max(method.tolerance, PRELIMINARY), constraint_tolerance=missed)
 
 
-def _outlined(
-    problem: Problem, settings: SmootherSettings, stop: Stop
-) -> tuple[Problem, SmootherSettings, tuple[Iteration, ...]]:
-    """The problem with constraints refined along an outline, the settings for a plan to refine them again; iterations.
-
-    With a start, the constraints are refined along the plan that follows from it. Without, the outline is a few
-    iterations without these constraints, and the start of what follows if it does not keep them.
-    """
-    rough = settings
-    if settings.second_order(problem):
-        tolerance, missed = settings.final(problem), settings.violation_tolerance(problem)
-        missed = max(missed, min(constraint._rough for constraint in problem.constraints))
-        rough = replace(settings, tolerance=max(tolerance, PRELIMINARY), constraint_tolerance=missed)
-    if settings.start is not None:
-        return problem, rough, ()
+def _outlined(problem: Problem, settings: SmootherSettings, stop: Stop) -> tuple[Trajectory, tuple[Iteration, ...]]:
+    """The plan of a few iterations without the constraints that are refined, and these iterations."""
     free = problem.with_constraints([constraint for constraint in problem.constraints if not constraint._rough])
     with stop.not_counting():  # compiling
         guess, budget = resolve(None, free), Budget(min(OUTLINED, settings.max_iterations), stop)
         check_functions(free, guess.offset[0].copy())
-        run = SolveRun(free, rough, guess, free._start_or_zero, budget)
+        run = SolveRun(free, settings, guess, free._start_or_zero, budget)
     budget.report()
     with problem.dynamics.solving(stop.threads), stop.reporting("smooth"):
         run.smooth(OUTLINED)
-    outline, log = Trajectory(*copied(run.work.best), problem.dt), tuple(budget.log)
+    outline = Trajectory(*copied(run.work.best), problem.dt)
     run.give_back()
-    refined = problem._refined(outline) if np.isfinite(outline.states).all() else None
-    if refined is None:
-        return problem, settings, log
-    return refined, replace(rough, start=outline, starts=None) if settings.starts in (None, 1) else rough, log
+    return outline, tuple(budget.log)
 
 
 def _settings_from(kind: type[Settings], function: str, options: dict[str, Any]) -> Settings:

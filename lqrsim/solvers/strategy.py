@@ -1,8 +1,7 @@
 """The search: the attempts at one problem, in order, until one converges.
 
-`Search.solve` and `Search.choose_start` say what is tried in which order, and when; `finish.py` says what is done from
-one start. The budget of each start is `max_iterations`; all starts share one deadline (`budget.py`). Every answer is
-certified (`certify.py`).
+`Search.solve` says what is tried in which order, and when; `finish.py` says what is done from one start. The budget of
+each start is `max_iterations`; all starts share one deadline (`budget.py`). Every answer is certified (`certify.py`).
 """
 
 import contextlib
@@ -75,7 +74,7 @@ class Runs:
 
     def __init__(self, problem: Problem, settings: SmootherSettings, stop: Stop) -> None:
         self.problem, self.settings, self.stop = problem, settings, stop
-        self.allowed, self.known = settings.violation_tolerance(problem), Known()
+        self.allowed, self.known = settings.method(problem).violation, Known()
         self.named: list[tuple[str, SolveRun]] = []
         self.finished: list[tuple[SolveRun, RunResult]] = []
 
@@ -134,7 +133,7 @@ class Search:
     ) -> None:  # fmt: skip
         """By default from the caller's start, or the usual ones."""
         self._problem, self._settings, self._stop, self.runs = problem, settings, stop, Runs(problem, settings, stop)
-        self._exact = settings.second_order(problem)
+        self._exact = settings.method(problem).exact
         self._guided = multistart.path_weight(problem) > 0  # whether obstacles in the cost push the plan
         self._default = settings.start is None and settings.starts is None  # not by the caller's choice
         self.tried = not settings.safeguard  # whether other starts were tried, as far as they are to be
@@ -148,42 +147,62 @@ class Search:
         self._approaches = Approaches(self.runs)
         self._softening = Softening(self.runs, self._approaches)
 
-    def solve(self, *, trees: bool) -> Solution:
-        """The answer after all attempts, no worse than a plan that the caller gave; `trees` if they may grow."""
+    def solve(self, *, trees: bool = True) -> Solution:
+        """The first plan, if that is the answer, or the best after all attempts; `trees` if they may grow.
+
+        It is no worse than a plan that the caller gave.
+        """
         begun = [run for _, run in self.runs.named]
         guess = begun[0].initial_guess
         is_plan = self._settings.start is not None and guess.prior is None and guess.interior is None
         given = _given(begun[0]) if is_plan else None
         with self._stop.reporting("smooth"):
-            # The attempts after this block also solve problems with other dynamics, and set the threads for each.
             with self._problem.dynamics.solving(self._solving):
-                self.choose_start()
-                if trees and self.may_go_on and self.is_barred:
-                    self.grow_trees()
-                if self._settings.start is None and self._exact and not self._guided:
-                    self.try_detours()
-                self.leave_saddles()  # while the best plan is one
-            if self._default and self.may_go_on and self._approaches.unmoved():
-                self._approaches.push_and_approach()
-            too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self.runs.named)
-            if self._problem.risk > 0 and too_high and self.may_go_on:
-                self.retry_without_risk()
-            if self._default and self.may_go_on and (self._approaches.left_alone or not self.runs.best.success):
-                self._softening.soften()
-            if given is not None:
-                self.keep_given(given)
-            if not self.runs.best.success and self.may_go_on:
-                self._softening.alternate()
-            if not self.runs.best.success and self.may_go_on:
-                self._softening.leave_contact_modes()
-        solution = self._solution()
+                self.finish_promising()
+                answered = given is None and self.is_answered
+                if not answered:
+                    self.try_other_starts()
+                    if trees and self.may_go_on and self.is_barred:
+                        self.grow_trees()
+                    if self.touches_what_may_be_passed:
+                        self.try_detours()
+                    self.leave_saddles()  # while the best plan is one
+            if not answered:
+                self.try_other_dynamics(given)
+        run, result = self.runs.finished[0]
+        solution = self._solution(run, result if answered else self._judged(result))
         for run in begun:
             run.give_back()
         return solution
 
-    def choose_start(self) -> tuple[SolveRun, RunResult]:
-        """Finish the most promising of the given starts, and of others where it leads to a poor plan; the best run."""
-        self.finish_promising()
+    @property
+    def is_answered(self) -> bool:
+        """Whether the first plan has converged, and none of the attempts that may follow would begin."""
+        best = self.runs.best
+        if len(self.runs.finished) > 1 or not best.success or self._problem.risk > 0 or self._stop.due:
+            return False
+        at_saddle = best.certificate is not None and best.certificate.curvature is Curvature.SADDLE
+        poor = self._default and self._is_unacceptable
+        return not (at_saddle or poor or self.touches_what_may_be_passed or self._approaches.unmoved())
+
+    def try_other_dynamics(self, given: RunResult | None) -> None:
+        """The attempts that also solve problems with other dynamics, and set the threads for each."""
+        if self._default and self.may_go_on and self._approaches.unmoved():
+            self._approaches.push_and_approach()
+        too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self.runs.named)
+        if self._problem.risk > 0 and too_high and self.may_go_on:
+            self.retry_without_risk()
+        if self._default and self.may_go_on and (self._approaches.left_alone or not self.runs.best.success):
+            self._softening.soften()
+        if given is not None:
+            self.keep_given(given)
+        if not self.runs.best.success and self.may_go_on:
+            self._softening.alternate()
+        if not self.runs.best.success and self.may_go_on:
+            self._softening.leave_contact_modes()
+
+    def try_other_starts(self) -> None:
+        """Begin elsewhere, in turn, where the plans so far are poor."""
         lost = not np.isfinite(self.runs.best.cost) and self.runs.best.status is not Status.RISK_TOO_HIGH
         if lost and self._problem.start is not None and not self._stop.due:
             self.try_finite()
@@ -195,7 +214,6 @@ class Search:
             self.try_elsewhere()
         if self.needs_others and not self._guided:
             self.try_sinusoidal_controls()
-        return self.runs.finished[0]
 
     def finish_promising(self) -> None:
         """Finish the most promising run; with constraints, also the others, as long as they may cost less."""
@@ -358,11 +376,16 @@ class Search:
         self.runs.offer(chosen, result, better=result.violation <= best.violation and result.cost < best.cost)
         self.tried = not self._stop.due
 
-    def try_detours(self) -> None:
-        """If the best plan touches a constraint that may be passed on another side, finish plans from such paths."""
+    @property
+    def touches_what_may_be_passed(self) -> bool:
+        """Whether the best plan touches a constraint that may be passed on another side, chosen by no cost."""
+        if self._settings.start is not None or not self._exact or self._guided:
+            return False
         touched = itertools.compress(self.runs.best.multipliers, passable(self._problem))
-        if not any(multipliers.values.any() for multipliers in touched):
-            return
+        return any(multipliers.values.any() for multipliers in touched)
+
+    def try_detours(self) -> None:
+        """Finish plans from paths that pass on another side."""
         tried = {name for name, _ in self.runs.named}
         for name, trajectory in multistart.detours(self._problem, self._settings.starts).items():
             if name not in tried and not self._stop.due:
@@ -441,9 +464,9 @@ class Search:
         # Of plans whose risk is too high, this one is near an optimum.
         self.runs.offer(run, result, better=result.rank <= self.runs.best.rank)
 
-    def _solution(self) -> Solution:
-        chosen, result = self.runs.finished[0]
-        problem, settings, stop = self._problem, self._settings, self._stop
+    def _judged(self, result: RunResult) -> RunResult:
+        """The best result with what is to be said of it after all attempts."""
+        problem, stop = self._problem, self._stop
         if not np.isfinite(result.states).all() and not result.success:
             result = replace(result, status=Status.NOT_FINITE, detail=left_domain(problem, result))
         elif result.status is Status.INFEASIBLE and not self.tried and stop.error is None:
@@ -457,10 +480,13 @@ class Search:
         if result.success and (cheapest := self.runs.cheaper_elsewhere(CHEAPER)) is not None:
             other = self._unfinished(*self.runs.finished[cheapest])
             result = replace(result, detail=joined(result.detail, other))
-        tolerances = {"tolerance": chosen.final, "constraint_tolerance": self.runs.allowed}
-        begun = self.runs.named[0][1] if settings.start is not None else chosen
-        options = settings.options(begun.initial_guess) | tolerances
-        return assemble(chosen, result, solver="smooth", options=options, candidates=self._candidates())
+        return result
+
+    def _solution(self, run: SolveRun, result: RunResult) -> Solution:
+        tolerances = {"tolerance": run.method.tolerance, "constraint_tolerance": self.runs.allowed}
+        begun = self.runs.named[0][1] if self._settings.start is not None else run
+        options = self._settings.options(begun.initial_guess) | tolerances
+        return assemble(run, result, solver="smooth", options=options, candidates=self._candidates())
 
     def _unfinished(self, run: SolveRun, result: RunResult) -> str:
         """That another plan costs less and has not converged, and how to go on from it; empty for an unnamed one."""
@@ -743,7 +769,7 @@ class Softening:
         """If the best plan ended within its contact modes, and one beside it is cheaper, descend out of them."""
         run, best = self._runs.finished[0]
         contacts = None if best.certificate is None else best.certificate.contacts
-        if contacts is None or not max(contacts.across, contacts.sampled) > run.final:
+        if contacts is None or not max(contacts.across, contacts.sampled) > run.method.tolerance:
             return
         run = self._runs.add(guess_from(best, "the best plan"), "the best plan, out of its contact modes")
         result = self._runs.result_of(run, refine, most=SOFT)
@@ -823,7 +849,9 @@ def _searched(problem: Problem, runs: Runs) -> tuple[SolveRun, RunResult]:
     """The best run of a search for another problem than that of these runs, as far as the choice of a start."""
     search = Search(problem, runs.settings, runs.stop, guides(problem, None))
     with problem.dynamics.solving(search._solving):
-        return search.choose_start()
+        search.finish_promising()
+        search.try_other_starts()
+    return search.runs.finished[0]
 
 
 def _given(run: SolveRun) -> RunResult:
