@@ -560,7 +560,8 @@ class Begun:
         return replay(self.source, self.sizes, "ilqr", *with_rows(given))
 
     def linearize(self) -> tuple[Any, ...]:
-        given = self.run._linearize_arguments(self.log)
+        run = self.run
+        given = run._plan_arguments(declarations.LINEARIZE, DAMPED_STEPS, run.method.rough, 0.0, 0, 0, self.log)
         return replay(self.source, self.sizes, "smoother", *with_rows(given))
 
 

@@ -64,7 +64,10 @@ def assemble(
     policy = partial(compiled.policy_of, problem)
     unstable, shorter = _unstable_step(problem, states, controls, sound=result.success)
     doubts = (_near_singular(problem, result), _fragile(problem, result)) if np.isfinite(states).all() else ()
-    said = result.detail, _usable(problem, result, options), *doubts, unstable, _sites(problem, states)
+    usable, remedy = "", shorter or result.remedy
+    if not result.success:
+        usable, remedy = _usable(problem, result, options), remedy_of(problem, result, log, options, shorter=shorter)
+    said = result.detail, usable, *doubts, unstable, _sites(problem, states)
     nominal = states.copy()  # a user may write to the states of the plan, as to convert angles for a plot
     later = {
         "inverse_policy": lambda: policy(*inverse_law, nominal[1:]) if inverse_law is not None else None,
@@ -76,7 +79,7 @@ def assemble(
         later,
         status=result.status,
         detail=joined(*said),
-        remedy=remedy_of(problem, result, log, options, shorter=shorter),
+        remedy=remedy,
         policy=policy(*law, nominal[:-1]),
         cost_to_go=deepcopy(result.values.get("cost_to_go")),
         cost_to_come=deepcopy(result.values.get("cost_to_come")),
@@ -270,12 +273,12 @@ def _reach(rate: complex) -> float:
 def remedy_of(
     problem: Problem, result: RunResult, log: Sequence[Iteration], options: dict[str, object], *, shorter: str
 ) -> str:
-    """The remedy for this case, such as `shorter` steps, or else the usual one; empty for a success that needs none."""
+    """The remedy for a failure, such as `shorter` steps, or else the usual one."""
     status = result.status
     lost = status in (Status.NOT_FINITE, Status.NOT_POSITIVE_DEFINITE, Status.DIVERGED)
     if lost and options.get("safeguard") is False:
         return "solve with safeguard=True, whose steps only lower the cost"
-    if shorter or status.success or result.remedy:
+    if shorter or result.remedy:
         return shorter or result.remedy
     if inside := problem.goal_inside:
         geoms = any("geoms" in term.shape for term in problem.kept_clear)

@@ -47,7 +47,7 @@ def by_multipliers(run: SolveRun) -> RunResult:
         run = _again(run, run.problem, replace(run.initial_guess, multipliers=()))
     result = run.run_to_end()
     if run.budget.over:
-        if result.success and not run.work.keeps(run.work.constraint_values(result.plan)):
+        if result.success and not run.work.keeps(result.plan):
             status = Status.TIME_LIMIT if run.budget.stop.due else Status.MAX_ITERATIONS
             result = replace(result, status=status, detail="before the constraints could be met")
     elif result.success:
@@ -282,7 +282,7 @@ class AugmentedLagrangian:
 
     def evaluate(self, plan: Motion) -> None:
         self._plan, stated = plan, self._work.constraint_values(plan)
-        self.kept, self._values, excess = self._work.keeps(stated), list[Array](), [0.0]
+        self.kept, self._values, excess = self._work.keeps(plan), list[Array](), [0.0]
         for multipliers, values in zip(self._constraints, stated, strict=True):
             self._values.append(values.ravel() - multipliers.margin)
             excess.append(violation_of(multipliers.term, values) - multipliers.term.equality * self._allowed)

@@ -54,8 +54,7 @@ Flags = npt.NDArray[np.bool_]
 
 def certified(run: SolveRun, result: RunResult) -> RunResult:
     """The result with its certificate; NOT_CERTIFIED if that contradicts a success."""
-    values = run.work.constraint_values(result.plan)
-    violation, value, wrong = run.work.violation(values), result.values.get("cost_to_go"), ""
+    violation, value, wrong = run.work.violation_of(result.plan), result.values.get("cost_to_go"), ""
     to_go = no_value(result.states)
     if value is not None:
         to_go = CostToGo(*map(in_c_order, (value.hessian, value.gradient, np.asarray(value.constant))))
@@ -73,7 +72,7 @@ def certified(run: SolveRun, result: RunResult) -> RunResult:
             certificate = replace(certificate, optimality=evaluated.optimality)
         wrong = faults(
             certificate, claimed=run.budget.log[-1].cost, rounding=CANCELLATION * scale,
-            tolerance=tolerance, kept=run.work.keeps(values),
+            tolerance=tolerance, kept=run.work.keeps(result.plan),
         )  # fmt: skip
     if run.problem.noise_term is not None and run.problem.constraint_terms:
         certificate = replace(certificate, cost=expected_cost(run, result))

@@ -32,7 +32,7 @@ from lqrsim.results.solution_parts import (
 )
 from lqrsim.solvers import compiled
 from lqrsim.solvers.budget import ATTENTION, Budget, in_slices
-from lqrsim.solvers.settings import INSIDE, InitialGuess, Method, SmootherSettings
+from lqrsim.solvers.settings import INSIDE, InitialGuess, SmootherSettings
 from lqrsim.solvers.stages import Pool, Stages
 
 _METHODS = {getattr(declarations, name): name.lower() for name in ("SMOOTH", "DAMPED", "REJECTED", "ILQR", "NEWTON")}
@@ -138,8 +138,7 @@ class RunResult:
             return False
         # The violations to two digits; 0 within the tolerances.
         missed, others = (
-            0.0 if work.keeps(work.constraint_values(result.plan)) else float(f"{result.violation:.2g}")
-            for result in (self, other)
+            0.0 if work.keeps(result.plan) else float(f"{result.violation:.2g}") for result in (self, other)
         )
         return missed > others or (missed == others and self.costs_more(other, work))
 
@@ -196,11 +195,12 @@ class SolveRun:
         self.problem, self.settings, self.initial_guess, self.budget = problem, settings, initial_guess, budget
         kind = entry, compiled.core(problem, settings.form), problem.steps
         self.work = _pool.take(lambda idle: idle.kind == kind) or Workspace(problem, settings.form, entry)
-        self.method = settings.method(problem)
-        self.work.begin(problem, settings, self.method, initial_guess, start)
+        self.work.begin(problem, settings, initial_guess, start)
+        self.method = self.work.method
         self._stages: Stages | None = None
         self._rows, self._row = np.zeros(max(budget.left, 1), LOG), 0  # rows of smoothing, and the next row
         self._last: Iteration | None = None  # the last iteration of smoothing
+        self._set_aside = list[tuple[Array, Array]](), 0  # arrays and their copies, and iterations at that time
         self.ending = Ending(declarations.RUNNING)
         self._valley = VALLEY if self.method.curved else 0.0
         # Fractions of the obstacle costs in the iterations; the last fraction holds for all later iterations.
@@ -239,11 +239,11 @@ class SolveRun:
         """
         self.smooth(len(self._rows))
         if self.ending.outcome == declarations.IN_VALLEY:
-            checkpoint, begin = self.checkpoint(), len(self.budget.log)
+            self.set_aside()
             result = self.newton()
             if result.success or self.budget.over:
                 return result
-            self.go_on(checkpoint, self.budget.log[begin:])
+            self.resume()
             self.smooth(len(self._rows))
         ending = self.checked_ending()
         lost = ending is not self.ending  # a function is not finite at the start, so nothing can help
@@ -369,20 +369,21 @@ class SolveRun:
             self._last = self.budget.log[-1]
         return ending
 
-    # Checkpoints.
-
-    def checkpoint(self) -> list[tuple[Array, Array]]:
-        """The arrays with the state of smoothing, and copies of them."""
+    def set_aside(self) -> None:
+        """Leave smoothing for another method; if that fails, `resume` goes on from here."""
         arrays = self.work.arrays
-        return [(array, array.copy()) for array in (*arrays.policy, *arrays.last_policy, *arrays.to_go, arrays.x_hat)]
+        saved = *arrays.policy, *arrays.last_policy, *arrays.to_go, arrays.x_hat
+        self._set_aside = [(array, array.copy()) for array in saved], len(self.budget.log)
 
-    def go_on(self, checkpoint: list[tuple[Array, Array]], others: Sequence[Iteration] = ()) -> None:
-        """Continue smoothing from a checkpoint, without the test that hands over to Newton's method.
+    def resume(self) -> None:
+        """Smooth from where that was set aside, without the test that hands over to Newton's method.
 
         Iterations of other methods that failed count as smoothing's, which has to make progress from there.
         """
-        for array, copy in checkpoint:
+        saved, begin = self._set_aside
+        for array, copy in saved:
             array[...] = copy
+        others = self.budget.log[begin:]
         for row, other in zip(self._rows[self._row :], others, strict=False):
             row["cost"], row["improvement"], row["gap"] = other.cost, other.improvement, other.gap
             row["optimality"] = np.nan
@@ -392,15 +393,13 @@ class SolveRun:
 
     def linearize_about_plan(self) -> float:
         """Compute policy and value functions about the plan in memory; return its optimality, NaN if that fails."""
-        rows = np.full(1, np.nan, LOG)
         self.work.begin_descent(DAMPED_STEPS)
-        self._loop(*self._linearize_arguments(rows))
-        return float(rows["optimality"][0])
+        return self._linearize()[0]
 
     def fails_at(self, risk: float) -> int:
         """The step at which a pass about the plan in memory fails with another risk, or -1; with noise only."""
         self.work.model.noise.risk[0] = risk
-        *_, failed = self._loop(*self._linearize_arguments(np.full(1, np.nan, LOG)))
+        _, failed = self._linearize()
         self.work.model.noise.risk[0] = self.problem.risk
         return failed
 
@@ -469,14 +468,13 @@ class SolveRun:
         term, arrays = self.problem.noise_term, self.work.arrays
         if term is None or not (term.active or self.problem.risk):
             return
-        rows, memory, to_go = np.full(1, np.nan, LOG), self.work.memory_rows.copy(), no_value(plan.states)
+        memory, to_go = self.work.memory_rows.copy(), no_value(plan.states)
         apart = arrays._replace(
             best=plan, last=self.work.trial, to_go=to_go, prior=self.work.no_prior, x_hat=arrays.x_hat.copy(),
             x_hats=arrays.x_hats.copy(), policy=deepcopy(arrays.policy),
             to_come=deepcopy(arrays.to_come), smoothing=deepcopy(arrays.smoothing),
         )  # fmt: skip
-        about = self._linearize_arguments(rows)
-        *_, failed = self._loop(*about._replace(model=self.work.without_penalties(), arrays=apart, memory=memory))
+        _, failed = self._linearize(model=self.work.without_penalties(), arrays=apart, memory=memory)
         if failed < 0:
             noise = self.work.model.noise
             noise.hessian[...], noise.gradient[...], noise.risk[2] = to_go.hessian, to_go.gradient, 1.0
@@ -570,8 +568,12 @@ class SolveRun:
         options = {"descent": how, "gap_tolerance": max(self.settings.gap_tolerance, gap_tolerance)}
         return self._stated(task, first, last, rows, tolerance, options, prior=self.work.no_prior, last=self.work.trial)
 
-    def _linearize_arguments(self, rows: StructuredArray) -> LoopCall:
-        return self._plan_arguments(declarations.LINEARIZE, DAMPED_STEPS, self.method.rough, 0.0, 0, 0, rows)
+    def _linearize(self, **changed: Any) -> tuple[float, int]:
+        """The optimality of the plan in memory, NaN if a pass fails, and the step at which it does, or -1."""
+        rows = np.full(1, np.nan, LOG)
+        call = self._plan_arguments(declarations.LINEARIZE, DAMPED_STEPS, self.method.rough, 0.0, 0, 0, rows)
+        *_, failed = self._loop(*call._replace(**changed))
+        return float(rows["optimality"][0]), failed
 
     def _check_arguments(self, task: int, result: RunResult, to_go: CostToGo, certificate: StructuredArray) -> LoopCall:
         """Arguments for certifying a plan and its policy with this cost-to-go."""
@@ -603,7 +605,7 @@ class Workspace:
       multipliers: multipliers of each constraint; changes act at once.
       start: (n,) the start state. best: the best plan so far. last: the last rollout of smoothing. trial: the rollout
         that a line search from the best plan tries. core: the compiled iterations. kind: what its runs have in common.
-      fixed: whether the start is given exactly.
+      fixed: whether the start is given exactly. method: as in `SolveRun`.
     """
 
     def __init__(self, problem: Problem, form: str, entry: str) -> None:
@@ -626,13 +628,11 @@ class Workspace:
             self._calls[name] = module.lay_out(name, *arguments)
         return self._calls[name]
 
-    def begin(
-        self, problem: Problem, settings: SmootherSettings, method: Method, initial_guess: InitialGuess, start: Array
-    ) -> None:
+    def begin(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
         """Begin a solve. The memory may have served another solve of the same size and number of steps."""
-        self._problem, self._method, steps = problem, method, problem.steps
-        self.priced = np.isfinite(settings.price)
-        self.fixed = isinstance(problem.initial, FixedState)
+        self._problem, steps = problem, problem.steps
+        self.method = method = settings.method(problem)
+        self.priced, self.fixed = np.isfinite(settings.price), isinstance(problem.initial, FixedState)
         self.prior, self.prior_iterations = self.no_prior, 0
         if initial_guess.prior is not None:
             about = np.broadcast_to(initial_guess.prior.about, (steps + 1, len(start))).copy()
@@ -745,10 +745,10 @@ class Workspace:
     def violation_of(self, plan: Motion) -> float:
         return self.violation(self.constraint_values(plan))
 
-    def keeps(self, values: list[Array]) -> bool:
-        """Whether a plan with these values keeps all constraints within their tolerance, or at their price."""
-        allowed = partial(allowed_violation, tolerance=self._method.violation, spared=not self._method.exact)
-        pairs = zip((multipliers.term for multipliers in self.multipliers), values, strict=True)
+    def keeps(self, plan: Motion) -> bool:
+        """Whether a plan keeps all constraints within their tolerance, or at their price."""
+        allowed = partial(allowed_violation, tolerance=self.method.violation, spared=not self.method.exact)
+        pairs = zip((multipliers.term for multipliers in self.multipliers), self.constraint_values(plan), strict=True)
         return self.priced or all(violation_of(term, numbers) <= allowed(term) for term, numbers in pairs)
 
 

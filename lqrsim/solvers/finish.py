@@ -81,7 +81,9 @@ def finish(run: SolveRun, known: Known) -> RunResult:
     if run.initial_guess.interior is not None or (run.problem.constraints and run.method.exact):
         return ConstrainedRun(run, known).run_to_end()
     if not run.problem.constraints:
-        return certified(run, _without_constraints(run))
+        space = run.problem.control_coordinates
+        limited = np.isfinite([space.low, space.high]).any() and run.method.exact and run.problem.noise_term is None
+        return certified(run, _within_limits(run) if limited else run.run_to_end())
     result = by_multipliers(run)
     # It begins with the optimum without the constraints, which is often the same from all starts, so they count as one.
     if result.stuck and not known.evidence:
@@ -126,20 +128,18 @@ def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult
     return certified(run, run.newton(patient=True))
 
 
-def _without_constraints(run: SolveRun) -> RunResult:
+def _within_limits(run: SolveRun) -> RunResult:
     """Smoothing and Newton's method. The interior point if controls stay at their limits, or all else fails."""
-    problem, budget, space, point = run.problem, run.budget, run.problem.control_coordinates, InteriorRun(run)
-    if not run.method.exact or problem.noise_term is not None or not np.isfinite([space.low, space.high]).any():
-        return run.run_to_end()
+    budget, space, point = run.budget, run.problem.control_coordinates, InteriorRun(run)
     run.smooth(OPENING)
     controls = run.work.best.controls
     pressed = ((controls <= space.low) | (controls >= space.high)).any()
     if run.ending.outcome == declarations.RUNNING and pressed and np.isfinite(run.cost):
-        checkpoint, begin = run.checkpoint(), len(budget.log)
+        run.set_aside()
         result = point.run_from(copied(run.work.best), STRONG)
         if result is not None and result.success:
             return result
-        run.go_on(checkpoint, budget.log[begin:])
+        run.resume()
     result = run.run_to_end()
     if result.success or budget.stop.due or budget.left < 2:
         return result
@@ -157,7 +157,7 @@ def _without_constraints(run: SolveRun) -> RunResult:
 class InteriorRun:
     """The interior point for the problem of a run."""
 
-    idle = False  # whether the last plan did not press against any constraint
+    idle = False  # without second derivatives, whether the last plan did not press against any constraint
     _flat: RunResult | None = None  # the last result where the cost no longer changed
 
     def __init__(self, run: SolveRun) -> None:
@@ -191,7 +191,7 @@ class InteriorRun:
         """Make a result from a plan: by Newton's method if converged, else by a rollout. None if it is not finite."""
         if not np.isfinite(interior.plan.states).all():
             return None
-        self.idle = self._is_idle(interior)
+        self.idle = not self._curved and self._is_idle(interior)
         if interior.solved and (result := self._polished(interior)) is not None and result.success:
             return result
         # The rollout with gains about the plan, or without gains if this violates the constraints less.
@@ -452,12 +452,12 @@ class ConstrainedRun(InteriorRun):
             return self.run_from(self._smoothed, STRONG, stale=TROUBLED if self._guided and not self._curved else None)
         # If the optimum without constraints keeps them, it is the answer; with an ObstacleCost it is next to the
         # answer.
-        checkpoint = run.checkpoint()
+        run.set_aside()
         result = run.newton()
         if result.success and result.violation == 0:
             return result
         bottom = copied(result) if result.success else self._smoothed
-        run.go_on(checkpoint)
+        run.resume()
         if self._budget.stop.due:
             return None
         if not self._guided:

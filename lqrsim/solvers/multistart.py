@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
 from lqrsim.codegen.compiled_module import in_c_order
-from lqrsim.errors import Array, InputError
+from lqrsim.errors import Array
 from lqrsim.kernels.records import Motion
 from lqrsim.problem.derivative_check import functions_of
 from lqrsim.problem.parts import CostSum, terms_of, weighing_obstacles
@@ -231,16 +231,6 @@ def pushes(problem: Problem) -> Iterator[tuple[str, Array, Motion]]:
             plan = compiled.rollout(problem, gain, controls, start.copy())
             if np.isfinite(plan.states).all():
                 yield f"a push by {space.names[i]}", controls, plan
-
-
-def check_starts(problem: Problem, count: int | None) -> None:
-    """Raises InputError if more than one start is requested although there is nothing to go round."""
-    several = count is not None and count > 1
-    if several and path_weight(problem) == 0 and not (any(passable(problem)) and detours(problem)):
-        raise InputError(
-            f"starts: got {count}, want 1: there is nothing to go round. More starts need a start and a goal apart from"
-            " each other, and an ObstacleCost or a constraint on states between them"
-        )
 
 
 def path_weight(problem: Problem) -> float:

@@ -130,15 +130,9 @@ class PreparedSolver(OneVersion):
             sizes = stages.sizes(plan)
             InteriorPoint(stages, plan).run(tolerance=run.method.tolerance, violation=run.method.violation, most=1)
             restore(
-                stages,
-                plan,
-                sizes,
-                price=1.0,
-                most=1,
-                laps=Laps(run.budget),
-                over=lambda: True,
+                stages, plan, sizes, price=1.0, most=1, laps=Laps(run.budget), over=lambda: True,
                 stationary=lambda *_: False,
-            )
+            )  # fmt: skip
 
     @checked
     def check(self, problem: Problem) -> Problem:

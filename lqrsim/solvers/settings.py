@@ -291,7 +291,7 @@ class SmootherSettings(Settings):
     def method(self, problem: Problem) -> Method:
         """How a problem is solved; with stop="cost" by the paper's method."""
         exact = self.finish is not None and self.stop == "optimal" and can_be_exact(problem)
-        curved = exact and has_curvature(problem)
+        curved = exact and not problem.dynamics.by_mujoco
         tolerance = self.tolerance or (FINE if curved else LEARNED if exact else ROUGH)
         violation = self.constraint_tolerance or (MISSED if exact else SPARED)
         return Method(exact, curved, tolerance, max(tolerance, ROUGH) if exact else tolerance, violation)
@@ -304,9 +304,4 @@ def can_be_exact(problem: Problem) -> bool:
     of an MJCF. Without constraints, an iteration of smoothing is then worth several of Newton's; see
     `experiments/convergence.py`. With constraints, the interior point learns from secants what is missing.
     """
-    return problem.noise_term is None if problem.constraints else has_curvature(problem)
-
-
-def has_curvature(problem: Problem) -> bool:
-    """Whether the dynamics have second derivatives; the steps of an MJCF have none."""
-    return not problem.dynamics.by_mujoco
+    return problem.noise_term is None if problem.constraints else not problem.dynamics.by_mujoco

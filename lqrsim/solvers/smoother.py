@@ -33,7 +33,7 @@ from lqrsim.solvers.certify import certified
 from lqrsim.solvers.control_rates import solve_with_rates
 from lqrsim.solvers.engine import RunResult, SolveRun, copied
 from lqrsim.solvers.free_duration import solve_for_duration
-from lqrsim.solvers.multistart import STARTS, check_starts
+from lqrsim.solvers.multistart import STARTS, detours, passable, path_weight
 from lqrsim.solvers.settings import InitialGuess, InitialPrior, Settings, SmootherSettings, StartLike, resolve
 from lqrsim.solvers.strategy import Search
 
@@ -270,8 +270,11 @@ def _check_smooth(problem: Problem, settings: SmootherSettings) -> None:
             "initial: got a FixedState, want an initial cost such as QuadraticCost(weight, about=x_start):"
             ' the primal form has no other start; form="dual" has'
         )
-    if settings.start is None:
-        check_starts(problem, settings.starts)
+    if (settings.starts or 1) > 1 and path_weight(problem) == 0 and not (any(passable(problem)) and detours(problem)):
+        raise InputError(
+            f"starts: got {settings.starts}, want 1: there is nothing to go round. More starts need a start and a goal"
+            " apart from each other, and an ObstacleCost or a constraint on states between them"
+        )
 
 
 _NO_PRIOR = "start: got an InitialPrior, want controls, a Trajectory, an AffinePolicy or a Solution: iLQR has no prior"

@@ -170,7 +170,10 @@ class Search:
             if not answered:
                 self.try_other_dynamics(given)
         run, result = self.runs.finished[0]
-        solution = self._solution(run, result if answered else self._judged(result))
+        result = result if answered else self._judged(result)
+        tolerances = {"tolerance": run.method.tolerance, "constraint_tolerance": self.runs.allowed}
+        options = self._settings.options(run.initial_guess if self._settings.start is None else guess) | tolerances
+        solution = assemble(run, result, solver="smooth", options=options, candidates=self._candidates())
         for run in begun:
             run.give_back()
         return solution
@@ -210,7 +213,8 @@ class Search:
             self.try_past_constraints()
         if self.needs_others and self._guided:
             self.try_reweighted()
-        if self.needs_others and not self._guided and self.is_without_plan:
+        without_plan = bool(self._problem.constraints) and not self.runs.best.success
+        if self.needs_others and not self._guided and without_plan:
             self.try_elsewhere()
         if self.needs_others and not self._guided:
             self.try_sinusoidal_controls()
@@ -318,7 +322,7 @@ class Search:
     @property
     def is_barred(self) -> bool:
         """Whether no plan keeps the constraints, some of which may be passed on one side or another."""
-        return self.is_poor and self._exact and self.is_without_plan and any(passable(self._problem))
+        return self.is_poor and self._exact and not self.runs.best.success and any(passable(self._problem))
 
     def try_past_constraints(self) -> None:
         """Plan without the constraints that may be passed on one side or another.
@@ -482,12 +486,6 @@ class Search:
             result = replace(result, detail=joined(result.detail, other))
         return result
 
-    def _solution(self, run: SolveRun, result: RunResult) -> Solution:
-        tolerances = {"tolerance": run.method.tolerance, "constraint_tolerance": self.runs.allowed}
-        begun = self.runs.named[0][1] if self._settings.start is not None else run
-        options = self._settings.options(begun.initial_guess) | tolerances
-        return assemble(run, result, solver="smooth", options=options, candidates=self._candidates())
-
     def _unfinished(self, run: SolveRun, result: RunResult) -> str:
         """That another plan costs less and has not converged, and how to go on from it; empty for an unnamed one."""
         less = f"a plan that has not converged keeps the constraints and costs less, {result.cost:.6g}"
@@ -543,7 +541,8 @@ class Search:
             # It does nothing where no single control helps from rest, but several together would.
             nominal = problem.nominal_controls
             idle = np.abs(best.controls - nominal).max() <= IDLE * max(1.0, np.abs(nominal).max())
-            return self.is_without_plan or (best.success and best.cost > run.work.memory["negligible"] and idle)
+            does_nothing = best.success and best.cost > run.work.memory["negligible"] and idle
+            return does_nothing or (bool(problem.constraints) and not best.success)
         radius = max(cost.radius for cost in problem.obstacle_costs)
         if not best.success:
             return run.budget.left > 0
@@ -556,11 +555,6 @@ class Search:
             return True
         clearance = clearance_of(problem, best.states)
         return clearance is not None and not clearance.min() >= -0.5 * radius
-
-    @property
-    def is_without_plan(self) -> bool:
-        """Whether no plan so far keeps the constraints, if there are any."""
-        return bool(self._problem.constraints) and not self.runs.best.success
 
 
 class Approaches:
