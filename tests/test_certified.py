@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import sympy
 from oracle import planar_quadrotor
+from sampling import rarely
 from whole_problems.claims import contradictions
 
 import lqrsim as ls
@@ -20,6 +21,13 @@ from lqrsim.solvers.certify import faults
 GOOD = Certificate(
     cost=36.0, start=0.0, dynamics_residual=1e-15, policy_residual=1e-15, limits=0.0, violation=0.0, optimality=1e-6
 )
+
+
+WAGON = ls.Dynamics(lambda x, u, p: [x.v, u.a], states={"x": "m", "v": "m/s"}, controls={"a": "m/s^2"}, position=())
+RATE, BETWEEN = {"control_rate": ls.ControlRate(weight=[1.0])}, {"between_knots": True}
+FREE = {"duration": (1.0, 8.0), "time_weight": 1.0}
+# What a problem may ask beside its plan, for each of which loops are around solves.
+LOOPS: list[dict[str, Any]] = [{}, RATE, BETWEEN, FREE, BETWEEN | FREE]
 
 
 class TestCertificate:
@@ -238,6 +246,37 @@ class TestExceptionsOnTheWay:
         solution = caught.value.solution  # pyright: ignore[reportAttributeAccessIssue]
         assert solution.status is Status.INTERRUPTED
         assert contradictions(problem, solution) == []
+
+    @pytest.mark.parametrize("when", [1, 2, *rarely(5, 9, 14, 20)])
+    @pytest.mark.parametrize("loops", LOOPS, ids=" ".join)
+    def test_in_loops_around_solves_the_plan_is_one_of_the_whole_problem(
+        self, loops: dict[str, Any], when: int
+    ) -> None:
+        """With a `control_rate`, the solves inside have the last command as a state."""
+        seen: list[Iteration] = []
+
+        def callback(iteration: Iteration) -> None:
+            seen.append(iteration)
+            if len(seen) == when:
+                raise KeyboardInterrupt
+
+        slow = ls.SymbolicConstraint(lambda x, u, p: 0.6 - x.v)
+        for solver, constraints in ((ls.smooth, [slow]), (ls.smooth, []), (ls.ilqr, [])):
+            if solver is ls.ilqr and loops.keys() != {"control_rate"}:
+                continue
+            problem = ls.Problem(
+                dynamics=WAGON, dt=0.2, steps=20, initial=ls.FixedState([0.0, 0.0]), stage_cost=ls.ControlCost([0.1]),
+                final_cost=ls.QuadraticCost([1.0, 1.0], about=[1.0, 0.0]), constraints=constraints, **loops,
+            )  # fmt: skip
+            seen.clear()
+            try:
+                solution = solver(problem, callback=callback)
+            except KeyboardInterrupt as error:
+                solution = error.solution  # pyright: ignore[reportAttributeAccessIssue]
+                assert solution.status is Status.INTERRUPTED
+            assert solution.trajectory.states.shape == (21, 2)
+            assert solution.policy.gain.shape == (20, 1, 2)
+            assert solver(problem, start=solution).success
 
 
 def test_nothing_is_compiled_in_mid_solve() -> None:

@@ -75,7 +75,7 @@ class SafePlan:
         """Cost of the plan with the obstacles as heavy as in the given problem, so that plans can be compared."""
         if self.weight == 1:
             return self.solution.cost
-        original, plan = _weighing(self.problem, 1 / self.weight), self.solution.trajectory
+        original, plan = _reweighted(self.problem, 1 / self.weight), self.solution.trajectory
         lighter, heavier = (
             costs_of(problem, plan.states[None], plan.controls[None])[0] for problem in (original, self.problem)
         )
@@ -147,8 +147,8 @@ def smooth_chance_constrained(
     return search.result()
 
 
-def _weighing(problem: Problem, times: float) -> Problem:
-    return problem.with_costs(stage_cost=weighing_obstacles(problem.stage_cost, times))
+def _reweighted(problem: Problem, factor: float) -> Problem:
+    return problem.with_costs(stage_cost=weighing_obstacles(problem.stage_cost, factor))
 
 
 def chances_instead(plan: SafePlan, uncertainty: Uncertainty) -> dict[str, float]:
@@ -241,14 +241,14 @@ class _Search:
     def heavier(self) -> Iterator[float]:
         """Plan with heavier obstacles, as long as no plan is safe enough and that helps; yields before each plan."""
         first = len(self.plans)
-        for times in HEAVIER if self.problem.obstacle_costs else ():
+        for factor in HEAVIER if self.problem.obstacle_costs else ():
             if self._best().success or self._gave_up(first):
                 return
-            yield times
-            problem = _weighing(self.problem, times)
+            yield factor
+            problem = _reweighted(self.problem, factor)
             solution, self.margin = smooth(problem), np.zeros((1, 1))
             if solution.success:
-                self._keep(problem, solution, times)
+                self._keep(problem, solution, factor)
 
     def _gave_up(self, first: int) -> bool:
         """Whether the last plans, counted from the given one on, were no safer than the safest of them."""

@@ -75,7 +75,7 @@ def meet_constraints(run: SolveRun, unconstrained: RunResult | None, *, stale: i
         lagrangian.evaluate(unconstrained.plan)
         if lagrangian.kept:
             return unconstrained
-        lagrangian.start()
+        lagrangian.begin()
         run.weigh_noise(unconstrained.plan)
         unconstrained = replace(unconstrained, plan=copied(unconstrained))  # the arrays will be overwritten
     undamped = _undamped(run, lagrangian, known=unconstrained is None, patience=stale)
@@ -102,7 +102,7 @@ def _first_feasible(run: SolveRun, result: RunResult) -> tuple[SolveRun, RunResu
     if not first.success or budget.over:
         # Only the constraint values of the plan are known. The certificate provides the cost.
         status = Status.TIME_LIMIT if budget.stop.due else Status.MAX_ITERATIONS if first.success else first.status
-        return run, replace(first, status=status, final=not first.success, values={})
+        return run, replace(first, status=status, decisive=not first.success, values={})
     initial_guess = replace(
         run.initial_guess, gain=first.law.gain.copy(), offset=first.law.offset.copy(), trajectory=None, prior=None,
         cost_to_go=first.values.get("cost_to_go"), multipliers=first.multipliers,
@@ -165,7 +165,7 @@ def _damped(
     if not plans:
         return undamped
     lagrangian.evaluate(plans[-1][0])
-    lagrangian.start()
+    lagrangian.begin()
     merits = []
     for plan, cost in plans:
         lagrangian.evaluate(plan)
@@ -195,7 +195,7 @@ def damped_to_end(run: SolveRun) -> RunResult:
         return certified(run, run.damped_result(damped, damped.status, damped.detail(run.problem.steps)))
     lagrangian = AugmentedLagrangian(run)
     lagrangian.evaluate(run.work.best)
-    lagrangian.start()
+    lagrangian.begin()
     return certified(run, _rounds(run, lagrangian, ""))
 
 
@@ -292,7 +292,7 @@ class AugmentedLagrangian:
             for multipliers, values in self._each()
         )
 
-    def start(self) -> None:
+    def begin(self) -> None:
         """Begin with zero multipliers, and with penalties that fit the cost of changing each constraint."""
         self._restart()
         for which, (multipliers, values) in enumerate(self._each()):

@@ -36,8 +36,8 @@ class Stop:
     """What all runs of a solve share: its caller's callback and threads, and the reason to end early.
 
     The reason is a deadline on the clock of `time.perf_counter`, or an exception. An exception of the callback, or
-    Ctrl-C, ends a solve like a deadline, with the best plan so far. `finish` raises the exception again, with that plan
-    as its `solution`.
+    Ctrl-C, ends a solve like a deadline, with the best plan so far. `deliver` raises it again, with that plan as its
+    `solution`.
     """
 
     callback: Callback | None = None  # called with the iterations of runs that are finished
@@ -108,7 +108,7 @@ class Stop:
         except BaseException as error:
             self.error = error
 
-    def finish(self, solution: Solution) -> Solution:
+    def deliver(self, solution: Solution) -> Solution:
         """Return the solution; or raise the exception that ended the solve, with the solution attached."""
         if self.error is None:
             return solution

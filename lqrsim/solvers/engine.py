@@ -110,7 +110,7 @@ class RunResult:
     values: dict[str, Any] = field(default_factory=dict)  # cost-to-go, cost-to-come and inverse law, for `assemble`
     multipliers: tuple[Multipliers, ...] = ()
     certificate: Certificate | None = None
-    final: bool = False  # whether no other start can do better
+    decisive: bool = False  # whether no other start can do better
     stuck: bool = False  # whether the violation no longer falls, however large the penalty
     # Of a plan whose violation is stationary: the violation in a measure that is the same for a whole search; and what
     # conflicts with the violated constraints, in words, the strongest first.
@@ -256,14 +256,14 @@ class SolveRun:
             return self.newton(patient=True)
         return self.safeguard(result) if self.settings.safeguard else result
 
-    def smooth(self, last: int) -> None:
-        """Continue until smoothing has done `last` iterations, or ends."""
+    def smooth(self, most: int) -> None:
+        """Continue until smoothing has done `most` iterations, or ends."""
         if self.ending.outcome != declarations.RUNNING:
             return
         if not self._row and not self.run_opening_pass():
             return
-        begin, last = len(self.budget.log), min(last, len(self._rows))
-        self.ending = self._iterate(self._arguments, self.work.arrays.last, self._rows, self._row, last)
+        begin, most = len(self.budget.log), min(most, len(self._rows))
+        self.ending = self._iterate(self._arguments, self.work.arrays.last, self._rows, self._row, most)
         if len(self.budget.log) > begin:
             self._row, self._last = self._row + len(self.budget.log) - begin, self.budget.log[-1]
         if self.ending.outcome == declarations.TIMED_OUT and not self._row:

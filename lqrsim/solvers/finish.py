@@ -108,7 +108,7 @@ def from_states(run: SolveRun, known: Known) -> RunResult:
     assert run.initial_guess.trajectory is not None
     point = InteriorRun(run)
     result = point.run_from(copied(run.initial_guess.trajectory), STRONG)
-    return certified(run, point.start() if result is None else result)
+    return certified(run, point.initial_rollout() if result is None else result)
 
 
 def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult | None:
@@ -144,7 +144,7 @@ def _within_limits(run: SolveRun) -> RunResult:
     if result.success or budget.stop.due or budget.left < 2:
         return result
     result = result.kept()
-    other = point.run_from(copied(run.work.best if np.isfinite(result.cost) else point.start()), STRONG)
+    other = point.run_from(copied(run.work.best if np.isfinite(result.cost) else point.initial_rollout()), STRONG)
     if other is None or other.success or not other.cost < result.cost:
         return other if other is not None and other.success else result
     other = other.kept()
@@ -185,9 +185,9 @@ class InteriorRun:
                 tolerance=run.method.tolerance, violation=self._allowed, most=min(MOST, budget.left - 1),
                 near=barrier is WEAK, laps=Laps(budget), over=over, hurried=budget.hurried,
             )  # fmt: skip
-        return None if result is None else self.finished(result)
+        return None if result is None else self.result_from(result)
 
-    def finished(self, interior: InteriorResult) -> RunResult | None:
+    def result_from(self, interior: InteriorResult) -> RunResult | None:
         """Make a result from a plan: by Newton's method if converged, else by a rollout. None if it is not finite."""
         if not np.isfinite(interior.plan.states).all():
             return None
@@ -233,7 +233,7 @@ class InteriorRun:
                 return True
         return False
 
-    def start(self) -> RunResult:
+    def initial_rollout(self) -> RunResult:
         """The rollout of the initial policy."""
         guess, start = self._run.initial_guess, self._run.work.start
         law = Policy(guess.gain, guess.offset)
@@ -348,10 +348,10 @@ class ConstrainedRun(InteriorRun):
         self._elastic = run.settings.elastic is not None
         if run.settings.penalty is None:
             self.without_multipliers()
-        self._start = self.start()  # the rollout of the first policy
+        self._initial = self.initial_rollout()
         self._keeps_start = self._guess.trajectory is not None or bool(self._guess.gain.any()) or stay
-        feasible = (self._keeps_start or run.settings.start is not None) and self._start.violation <= self._allowed
-        self._given = self._start if feasible else None  # the answer must not be worse
+        feasible = (self._keeps_start or run.settings.start is not None) and self._initial.violation <= self._allowed
+        self._given = self._initial if feasible else None  # the answer must not be worse
         self._untried = stay or not known.from_start  # the runs of a search have the same start
 
     def run_to_end(self) -> RunResult:
@@ -368,10 +368,10 @@ class ConstrainedRun(InteriorRun):
 
     def _attempts(self) -> Iterator[RunResult | None]:
         """The results of the attempts, each of which is made when it is asked for; None if it has none."""
-        run, budget, start, hard = self._run, self._budget, self._start, not self._elastic
+        run, budget, start, hard = self._run, self._budget, self._initial, not self._elastic
         from_start, multipliers = self._untried, tuple(record.values for record in self._guess.multipliers)
         if self._guess.interior is not None:  # of the search for a free duration: it is only finished
-            yield self.finished(self._guess.interior)
+            yield self.result_from(self._guess.interior)
         if budget.over:
             return
         if any(values.any() for values in multipliers):  # the plan of another solution, with its multipliers
@@ -410,9 +410,9 @@ class ConstrainedRun(InteriorRun):
 
     def _from_given(self) -> RunResult | None:
         # A sketch of a path is not near the answer, even if standing still keeps the constraints.
-        begin = self._guess.trajectory or self._start
-        near = self._start.violation <= self._allowed and np.allclose(begin.states, self._start.states)
-        self._untried &= near or not np.array_equal(begin.states, self._start.states)
+        begin = self._guess.trajectory or self._initial
+        near = self._initial.violation <= self._allowed and np.allclose(begin.states, self._initial.states)
+        self._untried &= near or not np.array_equal(begin.states, self._initial.states)
         return self.run_from(copied(begin), WEAK if near else STRONG)
 
     def _from_best_without_constraints(self) -> RunResult | None:
@@ -471,7 +471,7 @@ class ConstrainedRun(InteriorRun):
 
     def _from_start(self) -> RunResult | None:
         self._untried = False
-        return self.run_from(copied(self._start), STRONG)
+        return self.run_from(copied(self._initial), STRONG)
 
     def _from_multipliers(self) -> RunResult | None:
         """From the plan of the augmented Lagrangian, which stays near the local optimum that smoothing has chosen.
@@ -483,7 +483,7 @@ class ConstrainedRun(InteriorRun):
             result = meet_constraints(run, run.result(run.ending), stale=STALE)
         if result.success and not self._curved:
             return certified(run, result)
-        return self._after_multipliers(result, most=self._start.cost)
+        return self._after_multipliers(result, most=self._initial.cost)
 
     def _after_multipliers(self, result: RunResult, *, most: float = np.inf) -> RunResult | None:
         """The interior point from the last plan of the method of multipliers, unless it costs more than `most`."""
@@ -530,7 +530,7 @@ class ConstrainedRun(InteriorRun):
                 return None
             if priced.near or price == PRICES[-1]:
                 result = self.run_from(plan, STRONG)
-            elif self._untried and self._start.violation <= self._allowed:
+            elif self._untried and self._initial.violation <= self._allowed:
                 result = self._from_start()
             else:
                 continue
@@ -538,8 +538,8 @@ class ConstrainedRun(InteriorRun):
                 return result
         return None
 
-    def finished(self, interior: InteriorResult) -> RunResult | None:
-        return self._remember(super().finished(interior))
+    def result_from(self, interior: InteriorResult) -> RunResult | None:
+        return self._remember(super().result_from(interior))
 
     def _remember(self, result: RunResult | None) -> RunResult | None:
         if result is not None and (self._best is None or result.rank < self._best.rank):
@@ -553,7 +553,7 @@ class ConstrainedRun(InteriorRun):
     def _answer(self) -> RunResult:
         """The best result, certified."""
         run, stop = self._run, self._budget.stop
-        best = self._start if self._best is None else self._best
+        best = self._initial if self._best is None else self._best
         priced = self._elastic and best.success
         if self._given is not None and not priced and (best.violation > self._allowed or self._worse(best)):
             best = self._given

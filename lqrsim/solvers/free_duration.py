@@ -354,12 +354,12 @@ class DurationSearch:
     def solution(self) -> Solution:
         """The best plan, finished with its duration; or the best for a fixed duration, if none was found."""
         if self.best is not None:
-            finished = self._finished(*self.best)
+            solution = self._held(*self.best)
             # Each row is within the tolerance; all together may not be, where Newton's method fails that would end it.
             again = Budget(self._settings.max_iterations, self._stop)
-            if finished.status is Status.NOT_CERTIFIED and self._find(finished.trajectory, again, FINER)[0]:
-                finished = self._finished(*self.best)
-            return self._described(finished)
+            if solution.status is Status.NOT_CERTIFIED and self._find(solution.trajectory, again, FINER)[0]:
+                solution = self._held(*self.best)
+            return self._described(solution)
         first, last, chosen = self._fixed[0], self._fixed[-1], min(self._fixed, key=self._rank)
         if last.status is Status.INFEASIBLE and not chosen.success and not self._stop.due:
             detail = f"even in {last.trajectory.horizon:g} s {last.detail}"
@@ -377,7 +377,7 @@ class DurationSearch:
             remedy=f"{remedy}; or begin with start=solution of a fixed duration (duration=None, time_weight=0)",
         ))  # fmt: skip
 
-    def _finished(self, ordinary: Problem, result: InteriorResult) -> Solution:
+    def _held(self, ordinary: Problem, result: InteriorResult) -> Solution:
         """What becomes of a plan with its duration held. The log begins with that of the search for it."""
         summary, gain = f"a plan of {ordinary.steps * ordinary.dt:.6g} s", np.zeros_like(result.gain)
         guess = InitialGuess(gain, result.plan.controls, summary, interior=result, log=tuple(self._log))

@@ -95,8 +95,8 @@ def smooth(
       tolerance: tolerance of the optimality and of the relative change of cost (see `Iteration`); by default 1e-8;
         1e-4 without Newton's method, and 1e-5 with constraints that act and an MJCF's dynamics.
       gap_tolerance: tolerance of the gap (see `Iteration`).
-      max_iterations: the largest number of iterations that lead to the answer, by any method. In a search, each start
-        may use that many, including the further starts that are tried while no plan satisfies the constraints.
+      max_iterations: the largest number of iterations from a start, by any method. Each start of a search may use that
+        many, including those that are tried while no plan satisfies the constraints, and plans for softer contacts.
       time_limit: seconds after which the best plan so far is the answer, with the status TIME_LIMIT; compiling, which
         comes first, does not count, and if it takes long, a log line says so. An iteration that would end later, if it
         took as long as the last, is not begun.
@@ -305,7 +305,7 @@ def _solve_ilqr(problem: Problem, settings: Settings, stop: Stop | None = None) 
     solve_part: Callable[..., Solution] = partial(_iterate_ilqr, stop=stop)
     if problem.control_rate is not None:
         solve_part = partial(solve_with_rates, solve=solve_part)
-    return stop.finish(solve_part(problem, settings))
+    return stop.deliver(solve_part(problem, settings))
 
 
 def _iterate_ilqr(problem: Problem, settings: Settings, stop: Stop) -> Solution:
@@ -362,7 +362,7 @@ def solve(problem: Problem, settings: SmootherSettings, stop: Stop | None = None
     solution = solve_part(problem, settings)
     substeps = solution.options.get("substeps")  # of dynamics whose single steps may be too coarse to look with
     seen = replace(problem, dynamics=problem.dynamics.with_substeps(substeps)) if isinstance(substeps, int) else problem
-    return stop.finish(solution)._examined_by(partial(between_knots, seen, solution.trajectory))
+    return stop.deliver(solution)._examined_by(partial(between_knots, seen, solution.trajectory))
 
 
 def solve_refined(

@@ -236,7 +236,7 @@ class Search:
         # constraints, are approximate lower bounds on their costs with constraints.
         for run in sorted(others, key=lambda run: run.cost):
             best = self.runs.best
-            if self._stop.due or best.final or (best.success and not run.cost < best.cost):
+            if self._stop.due or best.decisive or (best.success and not run.cost < best.cost):
                 break
             self.runs.offer(run, self.runs.result_of(run))
 
@@ -421,13 +421,13 @@ class Search:
             return False
         saddle = at_saddle.kept()
         for size, sign in itertools.product(SADDLE_STEPS, (1, -1)):
-            moved = Trajectory(
+            beside = Trajectory(
                 saddle.states + sign * size * direction.states, saddle.controls + sign * size * direction.controls,
                 self._problem.dt,
             )  # fmt: skip
             run_beside = self.runs.another(guess_from(saddle, "a saddle"))
             run_beside.budget.report()
-            result = from_beside(run_beside, moved, saddle)
+            result = from_beside(run_beside, beside, saddle)
             if self._stop.due:
                 break
             if result is not None and result.success and result.cost < saddle.cost - SADDLE_DECREASE * abs(saddle.cost):
@@ -718,16 +718,16 @@ class Softening:
         are good, and a third of the plans goes on at each. Before, a plan that moves a body at last is softened by
         less: for the softest contacts, it would leave the body alone again.
         """
-        problem, moved = self._problem, self._approaches.best_nearer
-        begin = self._runs.best if moved is None else moved[1]
+        problem, nearer = self._problem, self._approaches.best_nearer
+        begin = self._runs.best if nearer is None else nearer[1]
         self.problems = [
             (name, replace(problem, dynamics=dynamics)) for name, dynamics in problem.dynamics.softened(begin.states)
         ]
         if not self.problems:
             return
         (name, widest), *harder = self.problems
-        if moved is not None:
-            self._stiffen({f", {moved[0]}": begin}, harder, [])
+        if nearer is not None:
+            self._stiffen({f", {nearer[0]}": begin}, harder, [])
             if self._runs.best.success or self._stop.due:
                 return
         results = {"": self._keep_softer(name, *_searched(widest, self._runs))}
