@@ -738,7 +738,7 @@ class TestRareEnds:
             log["cost"] = costs
             assert replay(source, SIZES, "cycling", with_rows(log), len(log) - 1) == cycling
             assert replay(source, SIZES, "no_progress", with_rows(log), len(log) - 1) == stuck
-        settings = Begun(problem()).run._linearize_arguments(np.zeros(1, LOG)).settings
+        settings = Begun(problem()).run._arguments(0, 0, np.zeros(1, LOG)).settings
         settings = settings._replace(tolerance=1e-4, gap_tolerance=1e-3)
         swinging, falling, small = [3e-2, 1e-2, 2e-2] * 4, [1e-1 * 0.8**k for k in range(12)], [1e-4] * 12
         for gaps, change, stuck in (

@@ -200,7 +200,6 @@ class SolveRun:
         self._stages: Stages | None = None
         self._rows, self._row = np.zeros(max(budget.left, 1), LOG), 0  # rows of smoothing, and the next row
         self._last: Iteration | None = None  # the last iteration of smoothing
-        self._set_aside = list[tuple[Array, Array]](), 0  # arrays and their copies, and iterations at that time
         self.ending = Ending(declarations.RUNNING)
         self._valley = VALLEY if self.method.curved else 0.0
         # Fractions of the obstacle costs in the iterations; the last fraction holds for all later iterations.
@@ -373,7 +372,7 @@ class SolveRun:
         """Leave smoothing for another method; if that fails, `resume` goes on from here."""
         arrays = self.work.arrays
         saved = *arrays.policy, *arrays.last_policy, *arrays.to_go, arrays.x_hat
-        self._set_aside = [(array, array.copy()) for array in saved], len(self.budget.log)
+        self._set_aside = [(array, array.copy()) for array in saved], len(self.budget.log)  # and iterations so far
 
     def resume(self) -> None:
         """Smooth from where that was set aside, without the test that hands over to Newton's method.

@@ -194,6 +194,10 @@ class InteriorRun:
         self.idle = not self._curved and self._is_idle(interior)
         if interior.solved and (result := self._polished(interior)) is not None and result.success:
             return result
+        return self._rolled_out(interior)
+
+    def _rolled_out(self, interior: InteriorResult) -> RunResult:
+        """The result from a plan that has not converged, or whose cost no longer changes."""
         # The rollout with gains about the plan, or without gains if this violates the constraints less.
         plan, gain = interior.plan, interior.gain
         laws = [compiled.law_about(*plan, gains) for gains in (gain.copy(), np.zeros_like(gain))]
@@ -552,26 +556,30 @@ class ConstrainedRun(InteriorRun):
 
     def _answer(self) -> RunResult:
         """The best result, certified."""
-        run, stop = self._run, self._budget.stop
+        run = self._run
         best = self._initial if self._best is None else self._best
         priced = self._elastic and best.success
         if self._given is not None and not priced and (best.violation > self._allowed or self._worse(best)):
             best = self._given
         if not best.success and self._problem.constraints:
-            lagrangian = AugmentedLagrangian(run)
-            lagrangian.evaluate(best.plan)
-            status = Status.STALLED if self._budget.left > 1 else Status.MAX_ITERATIONS
-            detail = lagrangian.worst()
-            if best.violation > self._allowed and (same := _alike(self._known.evidence)):
-                best = same[0]
-                lagrangian.evaluate(best.plan)
-                detail = lagrangian.worst()
-                status = Status.INFEASIBLE
-                others = [name for name in best.against if not detail.startswith(name.rsplit(" at ", 1)[0])][:NAMED]
-                best = replace(best, against=tuple(others))
-                detail += f"; against it stand {', '.join(others)}" if others else ""
-            best = replace(best, status=Status.TIME_LIMIT if stop.due else status, detail=detail)
+            best = self._failed(best)
         return best if best.certificate is not None else certified(run, best)
+
+    def _failed(self, best: RunResult) -> RunResult:
+        """The best plan of a failure, or the one that proves it, with what it misses in words."""
+        lagrangian = AugmentedLagrangian(self._run)
+        lagrangian.evaluate(best.plan)
+        status = Status.STALLED if self._budget.left > 1 else Status.MAX_ITERATIONS
+        detail = lagrangian.worst()
+        if best.violation > self._allowed and (same := _alike(self._known.evidence)):
+            best = same[0]
+            lagrangian.evaluate(best.plan)
+            detail = lagrangian.worst()
+            status = Status.INFEASIBLE
+            others = [name for name in best.against if not detail.startswith(name.rsplit(" at ", 1)[0])][:NAMED]
+            best = replace(best, against=tuple(others))
+            detail += f"; against it stand {', '.join(others)}" if others else ""
+        return replace(best, status=Status.TIME_LIMIT if self._budget.stop.due else status, detail=detail)
 
 
 def _alike(cases: Sequence[RunResult]) -> list[RunResult]:

@@ -347,10 +347,11 @@ def solve(problem: Problem, settings: SmootherSettings, stop: Stop | None = None
     stop = Stop() if stop is None else stop
     stop.begin(settings.time_limit)
 
-    def solve_part(problem: Problem, settings: SmootherSettings, *, trees: bool = True) -> Solution:
+    def search(problem: Problem, settings: SmootherSettings, *, trees: bool = True) -> Solution:
         return Search(problem, settings, stop).solve(trees=trees)
 
     # The loops that a problem needs, the innermost first: each solves problems with the one before.
+    solve_part: Callable[..., Solution] = search
     if any(constraint._rough for constraint in problem.constraints):
         solve_part = partial(solve_refined, solve=solve_part, stop=stop)
     if problem.duration is not None:
@@ -373,15 +374,19 @@ def solve_refined(
     With a start, the constraints are refined along the plan that follows from it. Without, they are at first refined
     along an outline, which is the start of what follows if it does not keep them.
     """
-    current, options, refinements, log = problem, _preliminary(problem, settings), REFINEMENTS, tuple[Iteration, ...]()
+    method, rough, current, refinements, log = settings.method(problem), settings, problem, REFINEMENTS, ()
+    if method.exact:  # a plan along which the constraints are to be refined once more
+        missed = max(method.violation, min(constraint._rough for constraint in problem.constraints))
+        rough = replace(settings, tolerance=max(method.tolerance, PRELIMINARY), constraint_tolerance=missed)
+    options = rough
     if settings.start is None:
-        outline, log = _outlined(problem, options, stop)
+        outline, log = _outlined(problem, rough, stop)
         refined = problem._refined(outline) if outline.finite else None
         if refined is None:
             options = settings
         else:
             current = refined
-            options = replace(options, start=outline, starts=None) if settings.starts in (None, 1) else options
+            options = replace(rough, start=outline, starts=None) if settings.starts in (None, 1) else rough
     preliminary, outlined = options is not settings, current is not problem
     while True:
         solution = solve(current, options, trees=trees)
@@ -392,25 +397,15 @@ def solve_refined(
         if stop.due or not (solution.success or (failed and outlined)):
             return solution
         if failed:  # no plan may keep the constraints as they are along the outline
-            options = _preliminary(problem, replace(settings, start=solution.trajectory, starts=None))
+            options = replace(rough, start=solution.trajectory, starts=None)
             current, outlined = problem, False
             continue
         refined = current._refined(solution.trajectory) if refinements else None
-        allowed = settings.method(current).violation
-        settled = solution.status is Status.COST_CONVERGED and solution.violation <= allowed
+        settled = solution.status is Status.COST_CONVERGED and solution.violation <= method.violation
         if refined is None and (settled or not preliminary):
             return solution
         current, options = refined or current, replace(settings, start=solution, starts=None)
         refinements, preliminary, outlined = refinements - 1, False, False
-
-
-def _preliminary(problem: Problem, settings: SmootherSettings) -> SmootherSettings:
-    """The settings for a plan along which constraints are to be refined once more."""
-    method = settings.method(problem)
-    if not method.exact:
-        return settings
-    missed = max(method.violation, min(constraint._rough for constraint in problem.constraints))
-    return replace(settings, tolerance=max(method.tolerance, PRELIMINARY), constraint_tolerance=missed)
 
 
 def _outlined(problem: Problem, settings: SmootherSettings, stop: Stop) -> tuple[Trajectory, tuple[Iteration, ...]]:

@@ -164,8 +164,7 @@ class Search:
                     self.try_other_starts()
                     if trees and self.may_go_on and self.is_barred:
                         self.grow_trees()
-                    if self.touches_what_may_be_passed:
-                        self.try_detours()
+                    self.try_detours()
                     self.leave_saddles()  # while the best plan is one
             if not answered:
                 self.try_other_dynamics(given)
@@ -186,7 +185,7 @@ class Search:
             return False
         at_saddle = best.certificate is not None and best.certificate.curvature is Curvature.SADDLE
         poor = self._default and self._is_unacceptable
-        return not (at_saddle or poor or self.touches_what_may_be_passed or self._approaches.unmoved())
+        return not (at_saddle or poor or self._detours() or self._approaches.unmoved())
 
     def try_other_dynamics(self, given: RunResult | None) -> None:
         """The attempts that also solve problems with other dynamics, and set the threads for each."""
@@ -199,10 +198,9 @@ class Search:
             self._softening.soften()
         if given is not None:
             self.keep_given(given)
-        if not self.runs.best.success and self.may_go_on:
-            self._softening.alternate()
-        if not self.runs.best.success and self.may_go_on:
-            self._softening.leave_contact_modes()
+        for attempt in (self._softening.alternate, self._softening.leave_contact_modes):
+            if not self.runs.best.success and self.may_go_on:
+                attempt()
 
     def try_other_starts(self) -> None:
         """Begin elsewhere, in turn, where the plans so far are poor."""
@@ -380,20 +378,20 @@ class Search:
         self.runs.offer(chosen, result, better=result.violation <= best.violation and result.cost < best.cost)
         self.tried = not self._stop.due
 
-    @property
-    def touches_what_may_be_passed(self) -> bool:
-        """Whether the best plan touches a constraint that may be passed on another side, chosen by no cost."""
-        if self._settings.start is not None or not self._exact or self._guided:
-            return False
-        touched = itertools.compress(self.runs.best.multipliers, passable(self._problem))
-        return any(multipliers.values.any() for multipliers in touched)
-
     def try_detours(self) -> None:
-        """Finish plans from paths that pass on another side."""
-        tried = {name for name, _ in self.runs.named}
-        for name, trajectory in multistart.detours(self._problem, self._settings.starts).items():
-            if name not in tried and not self._stop.due:
+        for name, trajectory in self._detours().items():
+            if not self._stop.due:
                 self.runs.try_from(name, trajectory)
+
+    def _detours(self) -> dict[str, Trajectory]:
+        """New paths on other sides of constraints that the best plan touches, by name, unless a cost chose its side."""
+        touched = itertools.compress(self.runs.best.multipliers, passable(self._problem))
+        chosen = self._settings.start is not None or not self._exact or self._guided
+        if chosen or not any(multipliers.values.any() for multipliers in touched):
+            return {}
+        tried = {name for name, _ in self.runs.named}
+        paths = multistart.detours(self._problem, self._settings.starts)
+        return {name: path for name, path in paths.items() if name not in tried}
 
     def leave_saddles(self) -> None:
         """Go down along a direction of negative curvature, and converge from there, while the best plan is a saddle.
