@@ -631,7 +631,7 @@ class Workspace:
         """Begin a solve. The memory may have served another solve of the same size and number of steps."""
         self._problem, steps = problem, problem.steps
         self.method = method = settings.method(problem)
-        self.priced, self.fixed = np.isfinite(settings.price), isinstance(problem.initial, FixedState)
+        self.priced, self.fixed = np.isfinite(method.price), isinstance(problem.initial, FixedState)
         self.prior, self.prior_iterations = self.no_prior, 0
         if initial_guess.prior is not None:
             about = np.broadcast_to(initial_guess.prior.about, (steps + 1, len(start))).copy()
@@ -639,7 +639,7 @@ class Workspace:
             self.prior_iterations = initial_guess.prior.iterations
         spare = INSIDE * method.violation if method.exact else method.violation
         self.multipliers = [
-            compiled.ConstraintMultipliers(problem, term, spare, settings.price) for term in problem.constraint_terms
+            compiled.ConstraintMultipliers(problem, term, spare, method.price) for term in problem.constraint_terms
         ]
         for multipliers, known in zip(self.multipliers, initial_guess.multipliers, strict=False):
             multipliers.penalty, multipliers.values[...] = known.penalty, known.values.ravel()

@@ -180,7 +180,7 @@ class InteriorRun:
             return budget.stop.due or since == stale
 
         with budget.stop.heeding():
-            point = InteriorPoint(run.stages, plan, barrier, price=run.settings.price, multipliers=multipliers)
+            point = InteriorPoint(run.stages, plan, barrier, price=run.method.price, multipliers=multipliers)
             result = point.run(
                 tolerance=run.method.tolerance, violation=self._allowed, most=min(MOST, budget.left - 1),
                 near=barrier is WEAK, laps=Laps(budget), over=over, hurried=budget.hurried,

@@ -83,6 +83,7 @@ class DurationSearch:
     ) -> None:
         assert problem.duration is not None
         self._problem, self._settings, self._solve = problem, settings, solve
+        self._method = settings.method(problem)
         self._range, self._stop = problem.duration, stop
         self._budget = Budget(settings.max_iterations, stop)
         # The cheapest optimum so far: the problem with its duration, and what the interior point found.
@@ -128,7 +129,7 @@ class DurationSearch:
         """What a few iterations make of a way in a fraction of the stated duration; its cost is infinite if it is far
         from the constraints. The duration is fixed or, in a problem `with_duration_state`, free.
         """
-        problem, price = self._problem, self._settings.price
+        problem, price = self._problem, self._method.price
         duration = float(np.clip(fraction * problem.steps * problem.dt, *self._range))
         fixed = problem._of_duration(duration)
         begin, budget = way.over(fixed), Budget(SKETCH, self._stop)
@@ -250,8 +251,7 @@ class DurationSearch:
 
         The iterations join the log of the budget, which may end the search.
         """
-        before, problem = len(budget.log), self._problem
-        tolerance = fraction * self._settings.method(problem).tolerance
+        before, problem, tolerance = len(budget.log), self._problem, fraction * self._method.tolerance
         budget.report()
         with self._stop.reporting("smooth"):
             by_segment = self._with_timed_segments(begin, budget) if problem.segments else None
@@ -282,7 +282,7 @@ class DurationSearch:
 
         With `hold`, the gaps of the plan are first closed with its duration, which must be that of the problem.
         """
-        n, violation = len(problem.dynamics.state_coordinates), self._settings.method(problem).violation
+        n, violation = len(problem.dynamics.state_coordinates), self._method.violation
         with self._stop.not_counting():  # compiling
             stages = Stages(with_duration_state(problem, by_segment=bool(segments)))
         stages.about.jumps[list(segments)] = 1.0  # the last state may jump there, each after the first
@@ -290,7 +290,7 @@ class DurationSearch:
         states = np.column_stack([begin.states, np.full(len(begin.states), begin.horizon)])
         plan = Motion(in_c_order(states), in_c_order(begin.controls))
         # The bounds of the duration hold at any price.
-        prices = np.where(stages.owners == len(problem.constraint_terms), np.inf, self._settings.price)
+        prices = np.where(stages.owners == len(problem.constraint_terms), np.inf, self._method.price)
 
         def run(
             plan: Motion, barrier: Barrier, tolerance: float, multipliers: tuple[Array, ...] = ()
@@ -318,7 +318,7 @@ class DurationSearch:
         """
         problem = self._problem
         _, _, result = self._searched(problem, begin, budget, tolerance=NEAR_SEGMENTS, segments=problem.segments)
-        allowed, measures = self._settings.method(problem).violation, result.measures
+        allowed, measures = self._method.violation, result.measures
         if not (result.solved or (measures.violation <= allowed and measures.gap < NEAR_SEGMENTS)):
             return None
         steps, old = problem.steps, np.array([0, *problem.segments, problem.steps])
@@ -344,7 +344,7 @@ class DurationSearch:
 
     def _rank(self, solution: Solution) -> tuple[float, float]:
         """Sort key, best first: the violation of a failed plan, then the cost with prices of time and violations."""
-        problem, plan, price = self._problem, solution.trajectory, self._settings.price
+        problem, plan, price = self._problem, solution.trajectory, self._method.price
         missed, paid = 0.0 if solution.success else solution.violation, 0.0
         if np.isfinite(price):
             stages = Stages(problem.with_duration_of(solution))

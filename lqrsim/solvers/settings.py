@@ -259,6 +259,7 @@ class Method(NamedTuple):
     tolerance: float  # of the answer
     rough: float  # of the smoothing before it, coarser if another method follows
     violation: float  # allowed of constraints, or the margin of inequalities at which the augmented Lagrangian aims
+    price: float  # of violating constraints, in cost per unit; infinite unless they are elastic
 
 
 @checked
@@ -283,18 +284,14 @@ class SmootherSettings(Settings):
         if self.penalty is not None and self.start is None:
             raise InputError(f"penalty: got {self.penalty:g} without a start, want start=... beside it")
 
-    @property
-    def price(self) -> float:
-        """Price of violating constraints, in cost per unit; infinite unless they are elastic."""
-        return np.inf if self.elastic is None else self.elastic
-
     def method(self, problem: Problem) -> Method:
         """How a problem is solved; with stop="cost" by the paper's method."""
         exact = self.finish is not None and self.stop == "optimal" and can_be_exact(problem)
         curved = exact and not problem.dynamics.by_mujoco
         tolerance = self.tolerance or (FINE if curved else LEARNED if exact else ROUGH)
+        rough = max(tolerance, ROUGH) if exact else tolerance
         violation = self.constraint_tolerance or (MISSED if exact else SPARED)
-        return Method(exact, curved, tolerance, max(tolerance, ROUGH) if exact else tolerance, violation)
+        return Method(exact, curved, tolerance, rough, violation, np.inf if self.elastic is None else self.elastic)
 
 
 def can_be_exact(problem: Problem) -> bool:

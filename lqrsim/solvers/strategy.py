@@ -221,11 +221,7 @@ class Search:
         """Finish the most promising run; with constraints, also the others, as long as they may cost less."""
         problem = self._problem
         chosen, *others = choose([run for _, run in self.runs.named], self._stop.threads)
-        driven = 2 * len(problem.control_coordinates) >= len(problem.dynamics.state_coordinates)
-        known = problem.start is not None and problem.goal is not None
-        # Where exact second derivatives are known, or constraints are to be kept, other methods follow smoothing.
-        plain = not problem.constraints and self._default and not self._exact
-        if driven and known and plain and self._settings.safeguard:
+        if not (problem.constraints or self._exact):  # for which other methods follow smoothing
             chosen = self.smooth_or_follow_a_line(chosen)
         self.runs.offer(chosen, self.runs.result_of(chosen))
         if not problem.constraints:
@@ -243,12 +239,17 @@ class Search:
 
         From the controls that hold an arm, the first plans may swing it through itself or the floor, where plans stay.
         """
+        problem = self._problem
+        driven = 2 * len(problem.control_coordinates) >= len(problem.dynamics.state_coordinates)
+        known = problem.start is not None and problem.goal is not None
+        if not (driven and known and self._default and self._settings.safeguard):
+            return run
         run.budget.report()
         run.smooth(self._settings.max_iterations)
         unfinished = Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.RISK_TOO_HIGH
         if run.ending.success or run.ending.status in unfinished or self._stop.due:
             return run
-        line = self.runs.add(line_of_states(self._problem), "a line of states")
+        line = self.runs.add(line_of_states(problem), "a line of states")
         line.budget.report()
         line.smooth(self._settings.max_iterations)
         return line if line.ending.success or line.work.cost < run.work.cost else run
