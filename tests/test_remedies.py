@@ -40,7 +40,7 @@ def test_ilqr_is_not_told_of_options_that_it_lacks(status: Status, limits: dict[
     of = problem(**limits)
     found = ls.ilqr(of, stop="cost")
     plan = Motion(found.trajectory.states, found.trajectory.controls)
-    failed = RunResult(status=status, plan=plan, law=Policy(found.policy.gain, found.policy.offset))
+    failed = RunResult(status=status, plan=plan, policy=Policy(found.policy.gain, found.policy.offset))
     remedy = remedy_of(of, failed, (), dict(found.options), shorter="")
     assert "finish" not in remedy
     if limits or status is Status.NOT_POSITIVE_DEFINITE:

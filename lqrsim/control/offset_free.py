@@ -59,7 +59,7 @@ from lqrsim.results.solution_parts import Trajectory
 from lqrsim.robots.sensors import RobotSensors
 from lqrsim.solvers import compiled
 from lqrsim.solvers.assembly import clearance_of
-from lqrsim.solvers.compiled import law_about
+from lqrsim.solvers.compiled import policy_about
 from lqrsim.solvers.settings import InitialGuess
 
 # The least errors that a filter assumes, relative to the tolerated effort: in each control, and in each state's
@@ -140,7 +140,7 @@ class FilterLaw:
     @cached_property
     def absolute(self) -> Policy:
         """The law of the estimates z themselves, u = gain z + offset: (T, m, Z) and (T, m)."""
-        gain, offset = law_about(self.nominal, self.model.plan.controls + self.tracking.offset, self.tracking.gain)
+        gain, offset = policy_about(self.nominal, self.model.plan.controls + self.tracking.offset, self.tracking.gain)
         return Policy(in_c_order(gain), offset)
 
     @cached_property

@@ -49,7 +49,7 @@ from lqrsim.problem.problem import Problem
 from lqrsim.results.coordinates import PerEntry
 from lqrsim.results.policy import AffinePolicy
 from lqrsim.results.solution import Solution
-from lqrsim.solvers.compiled import law_about, rollout
+from lqrsim.solvers.compiled import policy_about, rollout
 
 CONTROL_SHARE = 0.25  # default of the largest change of a control, relative to the range between its limits
 # The tolerances of the position at the plan's end, relative to those before. Reaching a goal depends on the position
@@ -401,7 +401,7 @@ def track(
 def _absolute_policy(solution: Solution, law: DeviationLaw) -> AffinePolicy:
     """The policy of a law about the solution's plan. The command in force has no effect on a command that arrives."""
     plan = solution.trajectory
-    gain, offset = law_about(plan.states, plan.controls + law.offset, law.gain[..., : plan.states.shape[1]])
+    gain, offset = policy_about(plan.states, plan.controls + law.offset, law.gain[..., : plan.states.shape[1]])
     return replace(solution.policy, gain=gain, offset=offset, nominal=plan.states[:-1].copy(), dt=plan.dt)
 
 

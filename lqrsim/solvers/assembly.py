@@ -55,13 +55,13 @@ def assemble(
     if falls and not result.success and result.status is not Status.NOT_POSITIVE_DEFINITE:
         result = replace(result, status=Status.DIVERGED, detail="the cost falls without bound")
     states, controls = map(np.copy, result.plan)
-    law = Policy(*map(np.copy, result.law))
-    inverse_law = result.values.get("inverse_law")
-    if inverse_law is not None:
-        inverse_law = Policy(*map(np.copy, inverse_law))
+    policy = Policy(*map(np.copy, result.policy))
+    inverse_policy = result.values.get("inverse_policy")
+    if inverse_policy is not None:
+        inverse_policy = Policy(*map(np.copy, inverse_policy))
     if problem.noise is not None:
         options = options | {"noise": repr(problem.noise), "risk": problem.risk}
-    policy = partial(compiled.policy_of, problem)
+    affine = partial(compiled.policy_of, problem)
     unstable, shorter = _unstable_step(problem, states, controls, sound=result.success)
     doubts = (_near_singular(problem, result), _fragile(problem, result)) if np.isfinite(states).all() else ()
     usable, remedy = "", shorter or result.remedy
@@ -70,7 +70,7 @@ def assemble(
     said = result.detail, usable, *doubts, unstable, _sites(problem, states)
     nominal = states.copy()  # a user may write to the states of the plan, as to convert angles for a plot
     later = {
-        "inverse_policy": lambda: policy(*inverse_law, nominal[1:]) if inverse_law is not None else None,
+        "inverse_policy": lambda: affine(*inverse_policy, nominal[1:]) if inverse_policy is not None else None,
         "clearance": lambda: clearance_of(problem, nominal),
         "problem_digest": lambda: problem.digest,
         "problem_parts": lambda: parts_of(problem),
@@ -80,7 +80,7 @@ def assemble(
         status=result.status,
         detail=joined(*said),
         remedy=remedy,
-        policy=policy(*law, nominal[:-1]),
+        policy=affine(*policy, nominal[:-1]),
         cost_to_go=deepcopy(result.values.get("cost_to_go")),
         cost_to_come=deepcopy(result.values.get("cost_to_come")),
         trajectory=Trajectory(states, controls, problem.dt),
@@ -191,7 +191,7 @@ def _fragile(problem: Problem, result: RunResult) -> str:
         return ""
     for draw in range(NEIGHBOURS):
         signs = np.sign(np.sin(1.0 + (1 + draw) * np.arange(1, len(space) + 1)))
-        run, _ = compiled.rollout(problem, *result.law, states[0] + OFFSET * signs)
+        run, _ = compiled.rollout(problem, *result.policy, states[0] + OFFSET * signs)
         if said := departure(space, run, states, problem.dt):
             return f"from a start that differs by {OFFSET:g} in each state, the policy {said}"
     return ""

@@ -104,8 +104,8 @@ def _first_feasible(run: SolveRun, result: RunResult) -> tuple[SolveRun, RunResu
         status = Status.TIME_LIMIT if budget.stop.due else Status.MAX_ITERATIONS if first.success else first.status
         return run, replace(first, status=status, decisive=not first.success, values={})
     initial_guess = replace(
-        run.initial_guess, gain=first.law.gain.copy(), offset=first.law.offset.copy(), trajectory=None, prior=None,
-        cost_to_go=first.values.get("cost_to_go"), multipliers=first.multipliers,
+        run.initial_guess, gain=first.policy.gain.copy(), offset=first.policy.offset.copy(), trajectory=None,
+        prior=None, cost_to_go=first.values.get("cost_to_go"), multipliers=first.multipliers,
     )  # fmt: skip
     run = _again(run, problem, initial_guess)
     if first.multipliers:

@@ -100,7 +100,7 @@ def certificate_of(
     numbers, interior = np.zeros(1, CERTIFICATE), run.initial_guess.interior
     numbers["typical"] = least = 0.0 if interior is None else interior.scale
     run.check(task, result, to_go, numbers)
-    cost, scale, typical, motion, law, beyond, decrease, _ = numbers[0].item()
+    cost, scale, typical, motion, policy, beyond, decrease, _ = numbers[0].item()
     start, initial = 0.0, run.problem.initial
     if isinstance(initial, FixedState):
         start = float(np.abs(result.states[0] - initial.numbers).max())
@@ -111,7 +111,7 @@ def certificate_of(
     size = typical if 0 < typical < CANCELLATION * abs(cost) else abs(cost)
     least = max(size, least, TYPICAL * typical, 1e-26 * scale, 1e-300)
     certificate = Certificate(
-        cost=cost, start=start, dynamics_residual=motion, policy_residual=law, limits=max(beyond, 0.0),
+        cost=cost, start=start, dynamics_residual=motion, policy_residual=policy, limits=max(beyond, 0.0),
         violation=violation, optimality=decrease / least if np.isfinite(decrease) else np.inf,
     )  # fmt: skip
     return certificate, scale
@@ -133,7 +133,7 @@ def curvature_of(run: SolveRun, result: RunResult) -> tuple[Curvature, Motion | 
     stages, plan = run.stages, Motion(*map(in_c_order, result.plan))
     multipliers = stages.of_constraints([multipliers.values for multipliers in result.multipliers])
     with np.errstate(all="ignore"):
-        return _Reduced(stages, plan, result.law.gain, multipliers).check()
+        return _Reduced(stages, plan, result.policy.gain, multipliers).check()
 
 
 def expected_cost(run: SolveRun, result: RunResult) -> float:

@@ -199,7 +199,7 @@ def rollout(problem: Problem, gain: Array, offset: Array, state: Array, *, dt: f
     return plan
 
 
-def law_about(states: Array, controls: Array, gain: Array) -> Policy:
+def policy_about(states: Array, controls: Array, gain: Array) -> Policy:
     """The policy with these gains (T, m, n) that tracks a plan: the gains, and its offsets (T, m)."""
     return Policy(gain, controls - np.einsum("tij,tj->ti", gain, states[:-1]))
 

@@ -369,8 +369,8 @@ class Descent:
 
     def result(self, status: Status, **others: Any) -> RunResult:
         plan = Motion(self.plan.states, self.plan.controls)
-        law = compiled.law_about(*plan, self.model.gain)
-        return RunResult(status=status, plan=plan, law=law, cost=self.plan.cost, violation=0.0, **others)
+        policy = compiled.policy_about(*plan, self.model.gain)
+        return RunResult(status=status, plan=plan, policy=policy, cost=self.plan.cost, violation=0.0, **others)
 
     def _go_to(self, plan: CostedPlan) -> None:
         count = self.model.points.shape[1] - 1
@@ -391,7 +391,7 @@ def linearized(problem: Problem, modes: ContactModes, state: Array, control: Arr
 
 def rolled_out(problem: Problem, states: Array, controls: Array, gain: Array) -> CostedPlan:
     """The plan of the policy with these gains about these states (T+1, n) and controls (T, m)."""
-    states, controls = compiled.rollout(problem, *compiled.law_about(states, controls, gain), states[0])
+    states, controls = compiled.rollout(problem, *compiled.policy_about(states, controls, gain), states[0])
     cost = compiled.cost_of(problem, states, controls) if np.isfinite(states).all() else np.inf
     return CostedPlan(states, controls, cost)
 

@@ -78,8 +78,8 @@ def feedback(
         stage = problem.stage_cost + bounding_cost(problem, controls)
         other = problem._with(control_rate=None, **problem._bound(stage_cost=stage))
         gain, cost_to_go = _gains(other, states, controls, multipliers[: len(problem.constraints)])
-    law = compiled.law_about(states, controls, gain)
-    return compiled.policy_of(problem, *law, states[:-1].copy()), cost_to_go
+    policy = compiled.policy_about(states, controls, gain)
+    return compiled.policy_of(problem, *policy, states[:-1].copy()), cost_to_go
 
 
 def _gains(
@@ -133,7 +133,7 @@ def rate_feedback(problem: Problem, solution: Solution) -> OutputFeedbackPolicy:
     pairs = zip(plan.states[:-1], plan.controls, strict=True)
     linearizations = [problem.dynamics.linearize(x, u, plan.dt) for x, u in pairs]
     A, B, c = (np.array(matrices) for matrices in zip(*linearizations, strict=True))
-    gain, offset = compiled.law_about(states, plan.controls, gain)
+    gain, offset = compiled.policy_about(states, plan.controls, gain)
     onto = np.eye(n + m, n)
     return OutputFeedbackPolicy(
         gain=gain, offset=offset, correction=np.tile(onto, (steps, 1, 1)), sensor=np.tile(np.eye(n), (steps, 1, 1)),

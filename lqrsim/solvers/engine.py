@@ -102,12 +102,12 @@ class RunResult:
 
     status: Status
     plan: Motion
-    law: Policy
+    policy: Policy
     cost: float = np.inf  # of the plan, as in the log; infinite without a plan
     violation: float = np.inf
     gap: float = np.nan
     detail: str = ""
-    values: dict[str, Any] = field(default_factory=dict)  # cost-to-go, cost-to-come and inverse law, for `assemble`
+    values: dict[str, Any] = field(default_factory=dict)  # cost-to-go, cost-to-come and inverse policy, for `assemble`
     multipliers: tuple[Multipliers, ...] = ()
     certificate: Certificate | None = None
     decisive: bool = False  # whether no other start can do better
@@ -160,7 +160,7 @@ class RunResult:
 
     def kept(self) -> "RunResult":
         """A copy that later iterations, which write to the same memory, do not change."""
-        return replace(self, plan=deepcopy(self.plan), law=deepcopy(self.law), values=deepcopy(self.values))
+        return replace(self, plan=deepcopy(self.plan), policy=deepcopy(self.policy), values=deepcopy(self.values))
 
 
 class LoopCall(NamedTuple):
@@ -416,7 +416,7 @@ class SolveRun:
         work, last = self.work, self._last
         return RunResult(
             status=ending.status, detail=ending.detail(self.problem.steps), plan=work.last,
-            law=work.arrays.last_policy, cost=_cost_of(last), violation=np.inf if last is None else last.violation,
+            policy=work.arrays.last_policy, cost=_cost_of(last), violation=np.inf if last is None else last.violation,
             gap=np.nan if last is None else last.gap,
             values={} if ending.pass_failed or last is None else work.value_functions(),
         )  # fmt: skip
@@ -432,28 +432,28 @@ class SolveRun:
     def damped_result(self, ending: Ending, status: Status, detail: str) -> RunResult:
         """Result of damped iterations or Newton's: the plan, with policy and value functions about it."""
         if ending.outcome in (declarations.RUNNING, declarations.TIMED_OUT):  # the run was stopped without looking back
-            law = self.work.arrays.last_policy
-            return self.best(RunResult(status=status, detail=detail, plan=self.work.last, law=law))
+            policy = self.work.arrays.last_policy
+            return self.best(RunResult(status=status, detail=detail, plan=self.work.last, policy=policy))
         return self.about_plan(status, detail, self.budget.log[-1].optimality if self.budget.log else np.nan)
 
     def about_plan(self, status: Status, detail: str = "", optimality: float | None = None) -> RunResult:
         """The plan in memory, with policy and value functions about it; by default these are computed now."""
         work, optimality = self.work, self.linearize_about_plan() if optimality is None else optimality
-        values, law, gap = {}, work.arrays.policy, float(work.memory["final_gap"])
+        values, policy, gap = {}, work.arrays.policy, float(work.memory["final_gap"])
         if not np.isfinite(optimality):  # there is neither a model about the plan nor a policy
-            law, gap = Policy(np.zeros_like(work.arrays.policy.gain), work.best.controls.copy()), np.nan
+            policy, gap = Policy(np.zeros_like(work.arrays.policy.gain), work.best.controls.copy()), np.nan
         else:
             values = work.value_functions()
             if not gap < self.settings.gap_tolerance:
                 # As for iLQR, whose steps need neither of these.
-                values["cost_to_come"] = values["inverse_law"] = None
+                values["cost_to_come"] = values["inverse_policy"] = None
                 off, gap = gap, np.nan
                 why = f"the states of least total cost are {off:.1g} off the plan"
                 if not np.isfinite(off):
                     why = "its pass needs a cost that is curved in every control"
                 detail = joined(detail, f"the cost-to-come is left out: {why}")
         return RunResult(
-            status=status, detail=detail, plan=work.best, law=law, cost=work.cost,
+            status=status, detail=detail, plan=work.best, policy=policy, cost=work.cost,
             violation=work.violation_of(work.best), gap=gap, values=values,
         )  # fmt: skip
 
@@ -577,7 +577,7 @@ class SolveRun:
     def _check_arguments(self, task: int, result: RunResult, to_go: CostToGo, certificate: StructuredArray) -> LoopCall:
         """Arguments for certifying a plan and its policy with this cost-to-go."""
         return self._stated(
-            task, 0, 0, self._rows, self.method.tolerance, {}, to_go=to_go, last=result.plan, last_policy=result.law,
+            task, 0, 0, self._rows, self.method.tolerance, {}, to_go=to_go, last=result.plan, last_policy=result.policy,
             certificate=certificate,
         )  # fmt: skip
 
@@ -682,20 +682,20 @@ class Workspace:
         memory["ilqr_left"], memory["ilqr_next"], memory["since_ilqr"] = 0.0, 2.0, 0.0
 
     def value_functions(self) -> dict[str, Any]:
-        """Cost-to-go, cost-to-come and inverse law of the last passes, for `assemble`."""
+        """Cost-to-go, cost-to-come and inverse policy of the last passes, for `assemble`."""
         to_go, to_come = Quadratic(*self.arrays.to_go), self.arrays.to_come
         inverse = self.arrays.smoothing.control_gain, self.arrays.smoothing.control
         if not self._dual:
-            return {"cost_to_go": to_go, "cost_to_come": Quadratic(*to_come), "inverse_law": inverse}
+            return {"cost_to_go": to_go, "cost_to_come": Quadratic(*to_come), "inverse_policy": inverse}
         covariance, mean, _ = to_come
-        law = None
+        policy = None
         if not self.fixed:  # otherwise the first covariances are singular
             # u = gain costate + offset, where the costate at a state of arrival x is -covariance^-1 (x - mean).
             with contextlib.suppress(np.linalg.LinAlgError):
                 gain = -np.linalg.solve(covariance[1:], np.swapaxes(inverse[0], 1, 2))
                 gain = np.ascontiguousarray(np.swapaxes(gain, 1, 2))
-                law = gain, inverse[1] - np.einsum("tij,tj->ti", gain, mean[1:])
-        return {"cost_to_go": to_go, "cost_to_come": Moments(*to_come), "inverse_law": law}
+                policy = gain, inverse[1] - np.einsum("tij,tj->ti", gain, mean[1:])
+        return {"cost_to_go": to_go, "cost_to_come": Moments(*to_come), "inverse_policy": policy}
 
     def without_penalties(self) -> records.ProblemModel:
         """The model without constraints, whose noise is weighed by its own cost-to-go."""

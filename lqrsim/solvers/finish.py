@@ -120,8 +120,8 @@ def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult
             if result is not None and result.success:
                 return certified(run, result)
         return None
-    law = compiled.law_about(plan.states, plan.controls, saddle.law.gain)
-    beside = point.result(compiled.rollout(run.problem, *law, plan.states[0].copy()))
+    policy = compiled.policy_about(plan.states, plan.controls, saddle.policy.gain)
+    beside = point.result(compiled.rollout(run.problem, *policy, plan.states[0].copy()))
     if not beside.cost < saddle.cost:
         return None
     run.work.set_best(beside.plan, beside.cost)
@@ -200,8 +200,8 @@ class InteriorRun:
         """The result from a plan that has not converged, or whose cost no longer changes."""
         # The rollout with gains about the plan, or without gains if this violates the constraints less.
         plan, gain = interior.plan, interior.gain
-        laws = [compiled.law_about(*plan, gains) for gains in (gain.copy(), np.zeros_like(gain))]
-        candidates = (self.result(self._run.work.roll_out(law, plan.states[0]), law) for law in laws)
+        policies = [compiled.policy_about(*plan, gains) for gains in (gain.copy(), np.zeros_like(gain))]
+        candidates = (self.result(self._run.work.roll_out(policy, plan.states[0]), policy) for policy in policies)
         result = min(candidates, key=lambda result: (not np.isfinite(result.cost), result.violation, result.cost))
         if not interior.flat or result.violation > self._allowed:
             return result
@@ -240,18 +240,18 @@ class InteriorRun:
     def initial_rollout(self) -> RunResult:
         """The rollout of the initial policy."""
         guess, start = self._run.initial_guess, self._run.work.start
-        law = Policy(guess.gain, guess.offset)
-        return self.result(self._run.work.roll_out(law, start), law)
+        policy = Policy(guess.gain, guess.offset)
+        return self.result(self._run.work.roll_out(policy, start), policy)
 
-    def result(self, plan: Motion, law: Policy | None = None) -> RunResult:
-        """The result for a plan that has not converged; without a law, its controls are applied without feedback."""
-        if law is None:
-            law = Policy(np.zeros((*plan.controls.shape, plan.states.shape[1])), plan.controls)
+    def result(self, plan: Motion, policy: Policy | None = None) -> RunResult:
+        """The result for a plan that has not converged; without a policy, its controls are applied without feedback."""
+        if policy is None:
+            policy = Policy(np.zeros((*plan.controls.shape, plan.states.shape[1])), plan.controls)
         cost, _ = self._run.stages.trial(plan)
         work = self._run.work
         violation = work.violation_of(plan) if np.isfinite(plan.states).all() else np.inf
         cost = cost if np.isfinite(cost) else np.inf
-        return RunResult(status=Status.MAX_ITERATIONS, plan=plan, law=law, cost=cost, violation=violation)
+        return RunResult(status=Status.MAX_ITERATIONS, plan=plan, policy=policy, cost=cost, violation=violation)
 
     def without_multipliers(self) -> None:
         for multipliers in self._run.work.multipliers:
@@ -260,8 +260,8 @@ class InteriorRun:
     def _polished(self, interior: InteriorResult) -> RunResult | None:
         """Finish a converged plan by Newton's method; None if its rollout is not finite."""
         work = self._run.work
-        law = compiled.law_about(interior.plan.states, *self._at_limits(interior))
-        plan = work.roll_out(law, interior.plan.states[0])
+        policy = compiled.policy_about(interior.plan.states, *self._at_limits(interior))
+        plan = work.roll_out(policy, interior.plan.states[0])
         if not np.isfinite(plan.states).all():
             return None
         self._set_multipliers(interior, work.constraint_values(plan), FIRMNESS)

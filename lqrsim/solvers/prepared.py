@@ -205,7 +205,7 @@ class PreparedSolver(OneVersion):
                     result, ended = finish(run, Known()), time.perf_counter()
             else:
                 result = _smoothed(run, best)
-                result = replace(result, cost=_cost_of(run, result.cost, result.plan, result.law))
+                result = replace(result, cost=_cost_of(run, result.cost, result.plan, result.policy))
                 ended = time.perf_counter()
         if stop.error is not None:
             raise stop.error
@@ -215,7 +215,7 @@ class PreparedSolver(OneVersion):
         found = best.result.kept()  # the next solve overwrites this memory
         answer = Replan(
             status=result.status, detail=result.detail, improved=best.improved,
-            policy=compiled.policy_of(problem, *found.law, found.states[:-1].copy()),
+            policy=compiled.policy_of(problem, *found.policy, found.states[:-1].copy()),
             trajectory=Trajectory(*found.plan, problem.dt), cost=found.cost, before=best.before,
             violation=found.violation, cost_to_go=found.values.get("cost_to_go"), multipliers=found.multipliers,
             goal=problem.weighed_goal, goal_radius=goal_radius_of(problem), iterations=len(budget.log),
@@ -262,19 +262,19 @@ def _smoothed(run: SolveRun, best: "_Best") -> RunResult:
         return replace(best.result, status=Status.NOT_FINITE, detail=str(error), cost=np.inf)
 
 
-def _cost_of(run: SolveRun, cost: float, plan: Motion, law: Policy) -> float:
+def _cost_of(run: SolveRun, cost: float, plan: Motion, policy: Policy) -> float:
     """The cost of a plan in a run: under noise with constraints without their penalties, which `cost` has there."""
     if run.problem.noise_term is None or not run.problem.constraints or not np.isfinite(cost):
         return cost
-    return expected_cost(run, RunResult(status=Status.STALLED, plan=plan, law=law))
+    return expected_cost(run, RunResult(status=Status.STALLED, plan=plan, policy=policy))
 
 
 class _Finder:
     """Finds the constrained optimum next to a plan, in time.
 
     Args:
-      run: a run with the initial law and multipliers. best: the plan that the law leads to.
-      plan: states and controls to which the law belongs; the first state is the start.
+      run: a run with the initial policy and multipliers. best: the plan that the policy leads to.
+      plan: states and controls to which the policy belongs; the first state is the start.
       closing: duration of the work after the last iteration, in s.
     """
 
@@ -333,7 +333,7 @@ class _Finder:
         detail = "no plan near it keeps the constraints" if active.hopeless and not solved else ""
         return RunResult(
             status=Status.CONVERGED if solved else self._unsolved, detail=detail, plan=plan,
-            law=compiled.law_about(*plan, gain), cost=cost, violation=run.work.violation(values),
+            policy=compiled.policy_about(*plan, gain), cost=cost, violation=run.work.violation(values),
             multipliers=active.multipliers(),
         )  # fmt: skip
 
@@ -387,8 +387,8 @@ class _Finder:
             tolerance=run.method.tolerance, violation=run.method.violation, most=budget.left, laps=self.laps,
             over=lambda _, seconds: self._late(model_seconds + seconds),  # the next may compute derivatives anew
         )  # fmt: skip
-        law = compiled.law_about(*result.plan, result.gain.copy())
-        plan = run.work.roll_out(law, self._plan.states[0])
+        policy = compiled.policy_about(*result.plan, result.gain.copy())
+        plan = run.work.roll_out(policy, self._plan.states[0])
         reached = stages.trial(plan)[0]
         found = rank(plan, reached)
         solved = result.solved and found[1] == 0
@@ -400,7 +400,7 @@ class _Finder:
             lagrangian = AugmentedLagrangian(run)
             lagrangian.evaluate(plan)
             detail = f"elastic: {lagrangian.worst()}"
-        answer = RunResult(status=status, detail=detail, plan=plan, law=law, cost=reached, violation=violation)
+        answer = RunResult(status=status, detail=detail, plan=plan, policy=policy, cost=reached, violation=violation)
         self._best.adopt(answer)
         return answer
 
@@ -424,7 +424,7 @@ class _Best:
         self.rolling_out = time.perf_counter() - clock
         last = self._work.last
         self.result = RunResult(
-            status=Status.TIME_LIMIT, plan=copied(last), law=Policy(guess.gain, guess.offset),
+            status=Status.TIME_LIMIT, plan=copied(last), policy=Policy(guess.gain, guess.offset),
             cost=_cost_of(run, self._work.cost, last, self._work.arrays.last_policy),
             violation=self._work.violation_of(last),
             values={"cost_to_go": guess.cost_to_go}, multipliers=guess.multipliers,
@@ -448,7 +448,7 @@ class _Best:
             iteration = replace(iteration, cost=cost)
         if self._better(iteration, self.result):
             if iteration.method == "newton":
-                parts = *arrays.best, *compiled.law_about(*arrays.best, arrays.policy.gain)
+                parts = *arrays.best, *compiled.policy_about(*arrays.best, arrays.policy.gain)
             else:
                 parts = *arrays.last, *arrays.last_policy, *arrays.to_go
             # The next iteration overwrites these. Copies are allocated once, since writing to new memory is slow.
@@ -461,7 +461,7 @@ class _Best:
                 np.copyto(copy, array)
             states, controls, gain, offset, *to_go = copies
             self.adopt(replace(
-                self.result, plan=Motion(states, controls), law=Policy(gain, offset), cost=iteration.cost,
+                self.result, plan=Motion(states, controls), policy=Policy(gain, offset), cost=iteration.cost,
                 violation=iteration.violation, values={"cost_to_go": Quadratic(*to_go)} if to_go else {},
             ))  # fmt: skip
 

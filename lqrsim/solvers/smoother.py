@@ -330,9 +330,9 @@ def _iterate_ilqr(problem: Problem, settings: Settings, stop: Stop) -> Solution:
         complete = bool(np.isfinite(run.linearize_about_plan()))
     (states, controls), gain = work.best, work.arrays.policy.gain
     # Without a pass about the trajectory the policy has no feedback.
-    law = compiled.law_about(states, controls, gain) if complete else Policy(np.zeros_like(gain), controls)
+    policy = compiled.policy_about(states, controls, gain) if complete else Policy(np.zeros_like(gain), controls)
     result = RunResult(
-        status=ending.status, detail=ending.detail(problem.steps), plan=work.best, law=law, cost=work.cost,
+        status=ending.status, detail=ending.detail(problem.steps), plan=work.best, policy=policy, cost=work.cost,
         violation=0.0, gap=0.0,
         values={"cost_to_go": Quadratic(*work.arrays.to_go)} if complete else {},
     )  # fmt: skip

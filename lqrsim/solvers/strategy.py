@@ -155,7 +155,7 @@ class Search:
         begun = [run for _, run in self.runs.named]
         guess = begun[0].initial_guess
         is_plan = self._settings.start is not None and guess.prior is None and guess.interior is None
-        given = _given(begun[0]) if is_plan else None
+        given = _initial_rollout(begun[0]) if is_plan else None
         with self._stop.reporting("smooth"):
             with self._problem.dynamics.solving(self._solving):
                 self.finish_promising()
@@ -598,7 +598,7 @@ class Approaches:
                 break
             drawn = self._runs.result_of(self._runs.another(None, through), refine, most=APPROACH).kept()
             self._tried.append(name)
-            plan = compiled.rollout(problem, *drawn.law, before.states[0].copy())
+            plan = compiled.rollout(problem, *drawn.policy, before.states[0].copy())
             if consider(name, guess_from(drawn, name), plan):
                 break
         plans.sort(key=lambda entry: entry[:2])
@@ -606,7 +606,7 @@ class Approaches:
         for _, _, name, begin in plans[:PUSHES]:
             run = self._runs.add(begin, name)
             with problem.dynamics.solving(self._stop.threads):
-                begun, other = _given(run), self._runs.result_of(run, refine)
+                begun, other = _initial_rollout(run), self._runs.result_of(run, refine)
             if other.is_worse(begun, run.work):  # a plan that no step can begin from is left by smoothing
                 status = Status.TIME_LIMIT if self._stop.due else Status.STALLED
                 other = replace(begun, status=status, detail="no step lowers the cost of this plan")
@@ -847,11 +847,11 @@ def _searched(problem: Problem, runs: Runs) -> tuple[SolveRun, RunResult]:
     return search.runs.finished[0]
 
 
-def _given(run: SolveRun) -> RunResult:
+def _initial_rollout(run: SolveRun) -> RunResult:
     """The rollout of the initial policy, certified, as a plan that the answer must not be worse than."""
     run.roll_out()
-    work, law = run.work, run.work.arrays.last_policy
-    result = RunResult(status=Status.STALLED, plan=work.last, law=law, cost=work.cost).kept()
+    work, policy = run.work, run.work.arrays.last_policy
+    result = RunResult(status=Status.STALLED, plan=work.last, policy=policy, cost=work.cost).kept()
     return certified(run, result) if np.isfinite(result.states).all() else result
 
 
@@ -878,7 +878,7 @@ def line_of_states(problem: Problem) -> Trajectory:
 
 def guess_from(result: RunResult, summary: str) -> InitialGuess:
     """The policy of a result as a start."""
-    return InitialGuess(result.law.gain.copy(), result.law.offset.copy(), summary)
+    return InitialGuess(result.policy.gain.copy(), result.policy.offset.copy(), summary)
 
 
 def _differ(plan: RunResult | Motion, other: RunResult | Motion, places: list[int]) -> bool:
