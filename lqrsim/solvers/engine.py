@@ -736,13 +736,10 @@ class Workspace:
         self._costs.slope_of_constraint(which, row, x, u, step, self.model.stage.constraints, slope)
         return slope
 
-    def violation(self, values: list[Array]) -> float:
-        """The largest violation of a constraint, given their values; infinite if one is NaN."""
-        pairs = zip(self.multipliers, values, strict=True)
-        return max((violation_of(multipliers.term, numbers) for multipliers, numbers in pairs), default=0.0)
-
     def violation_of(self, plan: Motion) -> float:
-        return self.violation(self.constraint_values(plan))
+        """The largest violation of a constraint; infinite if one is NaN."""
+        pairs = zip(self.multipliers, self.constraint_values(plan), strict=True)
+        return max((violation_of(multipliers.term, numbers) for multipliers, numbers in pairs), default=0.0)
 
     def keeps(self, plan: Motion) -> bool:
         """Whether a plan keeps all constraints within their tolerance, or at their price."""

@@ -327,13 +327,13 @@ class _Finder:
         self.may_be_far = not solved and in_time and budget.left > 1
         if not np.isfinite(active.measures).all():
             return replace(self._best.result, status=self._unsolved, detail=raised_by(functions_of(run.problem)))
-        plan, gain, cost, values = active.carried_out()
-        for term, numbers in zip(run.problem.constraint_terms, values, strict=True):
+        plan, gain, cost = active.carried_out()
+        for term, numbers in zip(run.problem.constraint_terms, run.work.constraint_values(plan), strict=True):
             solved = solved and violation_of(term, numbers) <= allowed_violation(term, run.method.violation)
         detail = "no plan near it keeps the constraints" if active.hopeless and not solved else ""
         return RunResult(
             status=Status.CONVERGED if solved else self._unsolved, detail=detail, plan=plan,
-            policy=compiled.policy_about(*plan, gain), cost=cost, violation=run.work.violation(values),
+            policy=compiled.policy_about(*plan, gain), cost=cost, violation=run.work.violation_of(plan),
             multipliers=active.multipliers(),
         )  # fmt: skip
 

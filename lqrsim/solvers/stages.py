@@ -550,12 +550,10 @@ class ActiveSet:
             self._call(active_set.TAKE)
         return outcome == CONVERGED
 
-    def carried_out(self) -> tuple[Motion, Array, float, list[Array]]:
-        """The rollout of the plan with gains (T, m, n) about it; the gains; its cost; the constraints' values."""
-        about, steps = self._stages.about, self._stages.steps
+    def carried_out(self) -> tuple[Motion, Array, float]:
+        """The rollout of the plan with gains (T, m, n) about it; the gains; its cost."""
         self._call(active_set.ROLL_OUT)
-        values = [rows.reshape(steps + 1, -1) for rows in about.values]
-        return deepcopy(self._arrays.out), about.policy.gain.copy(), self.measures.cost, values
+        return deepcopy(self._arrays.out), self._stages.about.policy.gain.copy(), self.measures.cost
 
     def multipliers(self) -> tuple[Multipliers, ...]:
         """The multipliers of each constraint, with a penalty."""
