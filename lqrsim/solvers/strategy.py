@@ -187,36 +187,6 @@ class Search:
         poor = self._default and self._is_unacceptable
         return not (at_saddle or poor or self._detours() or self._approaches.unmoved())
 
-    def try_other_dynamics(self, given: RunResult | None) -> None:
-        """The attempts that also solve problems with other dynamics, and set the threads for each."""
-        if self._default and self.may_go_on and self._approaches.unmoved():
-            self._approaches.push_and_approach()
-        too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self.runs.named)
-        if self._problem.risk > 0 and too_high and self.may_go_on:
-            self.retry_without_risk()
-        if self._default and self.may_go_on and (self._approaches.left_alone or not self.runs.best.success):
-            self._softening.soften()
-        if given is not None:
-            self.keep_given(given)
-        for attempt in (self._softening.alternate, self._softening.leave_contact_modes):
-            if not self.runs.best.success and self.may_go_on:
-                attempt()
-
-    def try_other_starts(self) -> None:
-        """Begin elsewhere, in turn, where the plans so far are poor."""
-        lost = not np.isfinite(self.runs.best.cost) and self.runs.best.status is not Status.RISK_TOO_HIGH
-        if lost and self._problem.start is not None and not self._stop.due:
-            self.try_finite()
-        if self.needs_others and self.is_barred:
-            self.try_past_constraints()
-        if self.needs_others and self._guided:
-            self.try_reweighted()
-        without_plan = bool(self._problem.constraints) and not self.runs.best.success
-        if self.needs_others and not self._guided and without_plan:
-            self.try_elsewhere()
-        if self.needs_others and not self._guided:
-            self.try_sinusoidal_controls()
-
     def finish_promising(self) -> None:
         """Finish the most promising run; with constraints, also the others, as long as they may cost less."""
         problem = self._problem
@@ -253,6 +223,36 @@ class Search:
         line.budget.report()
         line.smooth(self._settings.max_iterations)
         return line if line.ending.success or line.work.cost < run.work.cost else run
+
+    def try_other_starts(self) -> None:
+        """Begin elsewhere, in turn, where the plans so far are poor."""
+        lost = not np.isfinite(self.runs.best.cost) and self.runs.best.status is not Status.RISK_TOO_HIGH
+        if lost and self._problem.start is not None and not self._stop.due:
+            self.try_finite()
+        if self.needs_others and self.is_barred:
+            self.try_past_constraints()
+        if self.needs_others and self._guided:
+            self.try_reweighted()
+        without_plan = bool(self._problem.constraints) and not self.runs.best.success
+        if self.needs_others and not self._guided and without_plan:
+            self.try_elsewhere()
+        if self.needs_others and not self._guided:
+            self.try_sinusoidal_controls()
+
+    def try_other_dynamics(self, given: RunResult | None) -> None:
+        """The attempts that also solve problems with other dynamics, and set the threads for each."""
+        if self._default and self.may_go_on and self._approaches.unmoved():
+            self._approaches.push_and_approach()
+        too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self.runs.named)
+        if self._problem.risk > 0 and too_high and self.may_go_on:
+            self.retry_without_risk()
+        if self._default and self.may_go_on and (self._approaches.left_alone or not self.runs.best.success):
+            self._softening.soften()
+        if given is not None:
+            self.keep_given(given)
+        for attempt in (self._softening.alternate, self._softening.leave_contact_modes):
+            if not self.runs.best.success and self.may_go_on:
+                attempt()
 
     def try_finite(self) -> None:
         """Where states leave their domain, try constant controls under which they do not, and a line of states."""
