@@ -1,7 +1,8 @@
 """The search: the attempts at one problem, in order, until one converges.
 
-`Search.solve` says what is tried in which order, and when; `finish.py` says what is done from one start. The budget of
-each start is `max_iterations`; all starts share one deadline (`budget.py`). Every answer is certified (`certify.py`).
+`Search.solve` says what is tried in which order, and when; `finish.py` says what is done from one start. If nothing
+speaks against the first plan (`Search.is_answered`), nothing else is tried. The budget of each start is
+`max_iterations`; all starts share one deadline (`budget.py`). Every answer is certified (`certify.py`).
 """
 
 import contextlib
