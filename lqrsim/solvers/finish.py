@@ -540,15 +540,12 @@ class ConstrainedRun(InteriorRun):
                 continue
             if result is not None and result.success:
                 return result
+            self._remember(result)
         return None
 
-    def result_from(self, interior: InteriorResult) -> RunResult | None:
-        return self._remember(super().result_from(interior))
-
-    def _remember(self, result: RunResult | None) -> RunResult | None:
+    def _remember(self, result: RunResult | None) -> None:
         if result is not None and (self._best is None or result.rank < self._best.rank):
             self._best = result.kept()
-        return result
 
     def _worse(self, result: RunResult) -> bool:
         """Whether a plan costs more than the given one, which keeps the constraints, by more than rounding."""
