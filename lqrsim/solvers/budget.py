@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -296,24 +296,22 @@ class _Watch:
 
 @dataclass(eq=False)
 class _Activity:
-    """What a block of `reported` does: its name, and functions as there. `due` is the time of the next report."""
+    """What a block of `reported` does: its name, and functions as there; the time of the next report, and the wait."""
 
     what: str
     progress: Callable[[], str]
     called: Callable[[], float]
     begun: float
-
-    def __post_init__(self) -> None:
-        self._wait = SILENT
-        self.due = time.perf_counter() + self._wait
+    wait: float = field(default_factory=lambda: SILENT)
+    due: float = field(default_factory=lambda: time.perf_counter() + SILENT)
 
     def report(self, now: float) -> None:
         if now < self.due:
             return
         if now - self.called() >= SILENT:
             _log.warning("%s: %.0f s, %s", self.what, now - self.begun, self.progress())
-            self._wait = min(2 * self._wait, SELDOM)
-        self.due = now + self._wait
+            self.wait = min(2 * self.wait, SELDOM)
+        self.due = now + self.wait
 
 
 _watch = _Watch()
