@@ -237,6 +237,23 @@ def among_discs(seed: int) -> ls.Problem:
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("starts", [None, 1])
+def test_a_first_plan_is_the_answer_only_where_the_other_attempts_change_nothing(
+    seed: int, starts: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    far = [float(x) for x in np.random.default_rng(seed).uniform(0.8, 1.5, 2)]
+    goal = ls.QuadraticCost([100.0, 100.0, 1.0], about=[far[0], 0.2 * far[1], 0.0])
+    problems = among_discs(seed), in_the_plane(final_cost=goal), in_the_plane(stage_cost=ls.ControlCost([0.5, 0.5]))
+    found = [ls.smooth(problem, starts=starts) for problem in problems]
+    monkeypatch.setattr(strategy.Search, "is_answered", False)
+    for problem, one in zip(problems, found, strict=True):
+        other = ls.smooth(problem, starts=starts)
+        assert same(one, other)
+        assert (one.detail, one.remedy, one.options) == (other.detail, other.remedy, other.options)
+        assert [each.start for each in one.candidates] == [each.start for each in other.candidates]
+
+
 class TestConstraintsInTheWay:
     @given(seed=st.integers(0, 10_000))
     @settings(max_examples=examples(10))
