@@ -155,7 +155,12 @@ class CompiledModule:
 
     def addresses(self, *names: str) -> tuple[float, ...]:
         """The addresses of C functions, compiled together, for compiled code to call."""
-        return self._once(names, lambda: self._make_functions(names))
+
+        def make() -> tuple[float, ...]:
+            loaded, _ = self._load(f"{' and '.join(names[:2])} of {self.what}", {}, names)
+            return tuple(float(loaded.address(name)) for name in names)
+
+        return self._once(names, make)
 
     def _once(self, key: Any, make: Callable[[], Any]) -> Any:
         if key not in self._made:
@@ -172,38 +177,27 @@ class CompiledModule:
         self._made |= {(name, types[name]): entry for name, entry in entries.items()}
 
     def _make_entries(self, types: dict[str, tuple[Type, ...]]) -> dict[str, "Entry"]:
-        def write(program: Program, scope: Scope) -> list[list[Scalar]]:
-            return [program.entry(scope.function(name), of, f"entry_{name}") for name, of in types.items()]
-
-        label = f"{' and '.join(list(types)[:2])} for {self.what}"
-        loaded, returns = self._load(label, repr(types), write, not types.keys().isdisjoint(LONG))
+        loaded, returns = self._load(f"{' and '.join(list(types)[:2])} for {self.what}", types, ())
         pairs = zip(types.items(), returns, strict=True)
         return {name: Entry(of, loaded.address(f"entry_{name}"), kinds) for (name, of), kinds in pairs}
 
-    def _make_functions(self, names: tuple[str, ...]) -> tuple[float, ...]:
-        def write(program: Program, scope: Scope) -> list[list[Scalar]]:
-            for name in names:
-                program.export(scope.function(name), _signature(name, scope.sizes).members, name)
-            return []
-
-        loaded, _ = self._load(f"{' and '.join(names[:2])} of {self.what}", repr(names), write, False)
-        return tuple(float(loaded.address(name)) for name in names)
-
     def _load(
-        self, what: str, functions: str, write: Callable[[Program, Scope], list[list[Scalar]]], long: bool
+        self, what: str, entries: Mapping[str, tuple[Type, ...]], exported: tuple[str, ...]
     ) -> tuple[Loaded, list[list[Scalar]]]:
-        """Machine code of some functions, from disk or newly compiled, and the types that entries among them return."""
+        """Machine code of entries or of C functions, from disk or newly compiled, and the types that entries return."""
         sizes = repr(sorted(self._sizes.items()))
-        key = disk.key(_toolchain(), repr(instruction_set()), self._source.digest, sizes, functions)
+        key = disk.key(_toolchain(), repr(instruction_set()), self._source.digest, sizes, repr(entries or exported))
         if (unpacked := disk.made_of(disk.load(key), _unpacked)) is not None:
             self._loaded.append(unpacked[0])
             return unpacked
         compilations.append(what)
         # It is a warning, because scripts show warnings without setting up logging: a long silence would be worse.
-        log = logger.warning if long else logger.debug
+        log = logger.debug if entries.keys().isdisjoint(LONG) else logger.warning
         log(f"compiling {what}, once for this size (some seconds) ...")
-        program = Program()
-        returns = write(program, Scope(self._source, self._sizes))
+        program, scope = Program(), Scope(self._source, self._sizes)
+        returns = [program.entry(scope.function(name), types, f"entry_{name}") for name, types in entries.items()]
+        for name in exported:
+            program.export(scope.function(name), _signature(name, scope.sizes).members, name)
         code = object_code(program.text)
         loaded = Loaded(code)
         self._loaded.append(loaded)
