@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache, cached_property, partial
 from importlib.metadata import version
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -131,7 +131,6 @@ class UserFunction:
       columns: size of the rows in which the values are returned; 0 for a flat list.
       with_control: False for a `function(x, p)`.
       is_memory: whether the address is that of numbers instead of a function.
-      held: the object to keep alive and the address, once there is one.
       stopped: setting it ends the solves that call the function, in any thread.
     """
 
@@ -147,8 +146,7 @@ class UserFunction:
     unused: tuple[tuple[int, str], ...] = ()
     columns: int = 0
     with_control: bool = True
-    is_memory: bool = False
-    held: list[tuple[Any, int]] = field(default_factory=list, init=False, repr=False, compare=False)
+    is_memory: ClassVar[bool] = False
     stopped: threading.Event = field(default_factory=threading.Event, init=False, repr=False, compare=False)
     _thread: threading.local = field(default_factory=threading.local, init=False, repr=False, compare=False)
 
@@ -173,7 +171,7 @@ class UserFunction:
         Raises InputError if it fails, or returns an unsuitable result.
         """
         plain = self.function if self.level == "jax" else getattr(self.function, "py_func", self.function)
-        if not self.held:  # before the first call compiles its helpers
+        if "held" not in vars(self):  # before the first call compiles its helpers
             note_helpers(self.function)
         try:
             with np.errstate(all="ignore"):  # callers handle NaN and infinity
@@ -226,11 +224,12 @@ class UserFunction:
         return f"{self.values}: one for each of {', '.join(self.entries)}" if self.entries else "one number"
 
     @cached_property
-    def called_back(self) -> tuple[Any, int]:
-        """`f(x, u, data, out)` or `f(x, u, data, a, b)` in C, of pointers to float64, that calls it through Python.
+    def held(self) -> tuple[Any, int]:
+        """What to keep alive, and the address of `f(x, u, data, out)` or `f(x, u, data, a, b)`, of float64 pointers."""
+        return self._compile() if self.level == "compiled" else self._call_back()
 
-        With the object to keep alive before its address, as `compiled`.
-        """
+    def _call_back(self) -> tuple[Any, int]:
+        """A C function that calls this one through Python."""
         sizes = [int(np.prod(shape)) for shape in self.writes] or [self.values]
         end = self.offset + len(self.parameters)
 
@@ -270,9 +269,8 @@ class UserFunction:
         """Forget the exception, so that the function is called again."""
         self._thread.raised = None
 
-    @cached_property
-    def compiled(self) -> tuple[Any, int]:
-        """A C function that numba makes of this one: the object to keep alive, and its address."""
+    def _compile(self) -> tuple[Any, int]:
+        """A C function that numba makes of this one."""
         try:
             import numba
         except ImportError as error:
@@ -455,8 +453,7 @@ class JaxSteps(UserFunction):
         n, w = self.states, self.states + self.controls
         return n, self.controls, n, n, n * w, w * w
 
-    @cached_property
-    def called_back(self) -> tuple[Any, int]:
+    def _call_back(self) -> tuple[Any, int]:
         n, m, end = self.states, self.controls, self.offset + len(self.parameters)
 
         def callback(
@@ -654,9 +651,7 @@ def check_derivative(field: str, derivative: Any, function: Any, level: str, arg
 def address_of(function: UserFunction) -> float:
     """The address of a user's function, for compiled code."""
     with compiling:
-        if not function.held:
-            function.held.append(function.compiled if function.level == "compiled" else function.called_back)
-    return float(function.held[0][1])
+        return float(function.held[1])
 
 
 def view(address: int, size: int) -> Array:

@@ -454,14 +454,16 @@ class MjcfDynamics(Dynamics):
 class MjcfMemory(UserFunction):
     """The address that kernels call p, in the place of a function's: they find MuJoCo's memory of dynamics there."""
 
+    is_memory = True
+
     @classmethod
     def of(cls, dynamics: MjcfDynamics) -> "MjcfMemory":
         memory = cls(
             function=_nothing, level="compiled", states=len(dynamics.state_coordinates), controls=0, parameters=(),
-            offset=1, values=1, with_control=False, is_memory=True,
+            offset=1, values=1, with_control=False,
         )  # fmt: skip
-        memory.held.append((dynamics.physics, dynamics.physics.address()))
-        vars(memory).update(identity=dynamics.model_digest, of_what=dynamics)
+        held = dynamics.physics, dynamics.physics.address()
+        vars(memory).update(identity=dynamics.model_digest, held=held, of_what=dynamics)
         return memory
 
     def __reduce__(self) -> tuple[Any, ...]:
