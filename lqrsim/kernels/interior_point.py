@@ -351,11 +351,8 @@ def iterate(done, tolerance, stages, work, mem):
     if stages.learns == 1:
         least = LEAST_TOTAL * tolerance * mem.scale / max(mem.pairs, 1.0)
         if mem.unchanged >= FLAT_BEFORE_FALL and mem.parameter > least:
-            mem.parameter, mem.filter_rows, mem.unchanged = (
-                max(least, FALL_FACTOR * FALL_FACTOR * mem.parameter),
-                0.0,
-                0.0,
-            )
+            mem.parameter = max(least, FALL_FACTOR * FALL_FACTOR * mem.parameter)
+            mem.filter_rows, mem.unchanged = 0.0, 0.0
     lower_barrier(done, least, free, stages, work, mem)
     fraction = -1.0
     while True:
@@ -838,12 +835,8 @@ def slope_of_merit(stages, work, mem):
 
 def acceptable(fraction, point, cost, stages, work, mem):
     """Whether the filter accepts a trial."""
-    violated, merit, before, slope = (
-        total_violation(point, stages),
-        merit_of(point, cost, stages, mem),
-        mem.violated,
-        mem.slope,
-    )
+    violated, merit = total_violation(point, stages), merit_of(point, cost, stages, mem)
+    before, slope = mem.violated, mem.slope
     if not isfinite(merit) or violated > mem.farthest or gap_of(point, stages) > mem.farthest_gap:
         return False
     for k in range(int(mem.filter_rows)):

@@ -27,15 +27,7 @@ from lqrsim.results.solution import Solution
 from lqrsim.view import gl
 from lqrsim.view.cameras import Camera, CameraView, camera_view, draw_mark, mark_radius
 from lqrsim.view.options import OVERLAYS, Colour, Quality
-from lqrsim.view.overlays import (
-    Arrow,
-    Overlays,
-    Shown,
-    check_drawn,
-    common_scale,
-    error_colours,
-    legend_entries,
-)
+from lqrsim.view.overlays import Arrow, Overlays, Shown, check_drawn, common_scale, error_colours, legend_entries
 from lqrsim.view.recorded_trial import RecordedTrial, place_of, rows_of, tracked_balls
 
 Pixels = npt.NDArray[np.uint8]
