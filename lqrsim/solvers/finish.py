@@ -78,7 +78,7 @@ class Known:
 
 def finish(run: SolveRun, known: Known) -> RunResult:
     """Run from one start to the end; certified. `known` has the results of other runs of the same problem."""
-    if run.initial_guess.interior is not None or (run.problem.constraints and run.method.exact):
+    if run.initial_guess.interior is not None or run.method.interior:
         return ConstrainedRun(run, known).run_to_end()
     if not run.problem.constraints:
         space = run.problem.control_coordinates
@@ -93,7 +93,7 @@ def finish(run: SolveRun, known: Known) -> RunResult:
 
 def refine(run: SolveRun, known: Known) -> RunResult:
     """Run to the end from the rollout of the first policy, on the same side of the obstacles; certified."""
-    if run.problem.constraints and run.method.exact:
+    if run.method.interior:
         return ConstrainedRun(run, known, stay=True).run_to_end()
     result = damped_to_end(run)
     if not result.stuck:

@@ -74,7 +74,7 @@ def prepare(
         constraint_tolerance=constraint_tolerance, finish=finish,
     )  # fmt: skip
     solved = problem if problem.control_rate is None else with_last_command(problem)
-    if tolerance is None and solved.constraints and settings.method(solved).exact:
+    if tolerance is None and settings.method(solved).interior:
         if _can_yield(solved):
             settings = replace(settings, tolerance=COARSE)
         elif settings.method(solved).tolerance == FINE:
@@ -121,7 +121,7 @@ class PreparedSolver(OneVersion):
         run.work.constraint_values(run.work.best)
         for which in range(len(self.problem.constraint_terms)):
             run.work.constraint_slope(which, 0, state, guess.offset[0], 0)
-        if self.problem.constraints and run.method.exact:
+        if run.method.interior:
             stages, plan, best = run.stages, Motion(*run.work.best), _Best(run)
             _Finder(run, plan, best).find()
             if _can_yield(self.problem):
@@ -197,7 +197,7 @@ class PreparedSolver(OneVersion):
         run = SolveRun(problem, self.settings, guess, problem._start_or_zero, budget)
         best = _Best(run)
         with problem.dynamics.solving(self.threads):
-            if problem.constraints and run.method.exact:
+            if run.method.interior:
                 finder = _Finder(run, _plan_of(planned, best), best, self._closing)
                 result, ended = finder.find(), finder.laps.ended
                 if finder.may_be_far:

@@ -255,6 +255,7 @@ class Method(NamedTuple):
     """What ends the solve of a problem, and with which tolerances."""
 
     exact: bool  # Newton's method or, with constraints, the interior point; else smoothing and the augmented Lagrangian
+    interior: bool  # the interior point
     curved: bool  # with second derivatives of the dynamics
     tolerance: float  # of the answer
     rough: float  # of the smoothing before it, coarser if another method follows
@@ -287,11 +288,12 @@ class SmootherSettings(Settings):
     def method(self, problem: Problem) -> Method:
         """How a problem is solved; with stop="cost" by the paper's method."""
         exact = self.finish is not None and self.stop == "optimal" and can_be_exact(problem)
-        curved = exact and not problem.dynamics.by_mujoco
+        interior, curved = exact and bool(problem.constraints), exact and not problem.dynamics.by_mujoco
         tolerance = self.tolerance or (FINE if curved else LEARNED if exact else ROUGH)
         rough = max(tolerance, ROUGH) if exact else tolerance
         violation = self.constraint_tolerance or (MISSED if exact else SPARED)
-        return Method(exact, curved, tolerance, rough, violation, np.inf if self.elastic is None else self.elastic)
+        price = np.inf if self.elastic is None else self.elastic
+        return Method(exact, interior, curved, tolerance, rough, violation, price)
 
 
 def can_be_exact(problem: Problem) -> bool:

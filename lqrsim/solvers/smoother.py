@@ -250,16 +250,17 @@ def _check_smooth(problem: Problem, settings: SmootherSettings) -> None:
             if got != want:
                 raise InputError(f"{option}: got {got!r} with control_rate, want {want!r}: no step leads back from it")
         problem = with_last_command(problem)  # its constraints have the limits of rates
-    if problem.between_knots and not (settings.method(problem).exact and settings.elastic is None):
+    method = settings.method(problem)
+    if problem.between_knots and not (method.exact and settings.elastic is None):
         want = 'finish="newton" and stop="optimal", without elastic= and noise'
         raise InputError(f"between_knots: got True without an interior point that keeps all constraints, want {want}")
-    if settings.elastic is not None and not (problem.constraints and settings.method(problem).exact):
+    if settings.elastic is not None and not method.interior:
         if problem.constraints:
             noisy = settings.finish and settings.stop == "optimal"
             why = "with noise" if noisy else 'without finish="newton" and stop="optimal"'
             raise InputError(f"elastic: got {settings.elastic:g}, want None {why}")
         raise InputError(f"elastic: got {settings.elastic:g} for a problem without constraints, want None")
-    if problem.duration is not None and not settings.method(problem).exact:
+    if problem.duration is not None and not method.exact:
         raise InputError('duration: got a free one without the interior point, want finish="newton" and stop="optimal"')
     starts = settings.starts or (STARTS if settings.start is None and problem.obstacle_costs else 1)
     check_memory("starts", starts, problem.steps * problem.bytes_per_step)
