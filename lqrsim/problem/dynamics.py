@@ -5,7 +5,7 @@ import copy
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -29,9 +29,6 @@ from lqrsim.codegen.user_functions import (
 from lqrsim.errors import Array, InputError, check_array, check_count, check_items, check_name, excerpt
 from lqrsim.kernels import differences, runge_kutta, user_functions
 from lqrsim.results.coordinates import Coordinates, Limits
-
-if TYPE_CHECKING:
-    from lqrsim.scenes.contacts import ContactModes
 
 # The largest number of steps of second derivatives. A thousand take 0.6 s to derive and 1 s to compile; the aeroplane
 # of `experiments/altro_problems.py` takes 2,300.
@@ -295,10 +292,6 @@ class Dynamics:
           are not the robot's positions.
         """
         return iter(())
-
-    def contact_modes(self, dt: float) -> "ContactModes | None":
-        """The contact modes of periods of `dt` seconds; None, except for an MJCF whose switches are all known."""
-        return None
 
     @cached_property
     def step_source(self) -> Source:

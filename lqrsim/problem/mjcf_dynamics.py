@@ -359,6 +359,7 @@ class MjcfDynamics(Dynamics):
                 yield words, dynamics, np.pad(positions, [(0, 0), (0, len(change) - nv)], constant_values=np.nan)
 
     def contact_modes(self, dt: float) -> ContactModes | None:
+        """The contact modes of periods of `dt` seconds; None unless all switches are known."""
         known = not self.parameters and ContactModes.known_for(self.physics.model)
         return ContactModes(self.physics.model, round(dt / self.period)) if known else None
 

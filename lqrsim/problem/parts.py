@@ -307,7 +307,9 @@ class Cost(ProblemPart[CostTerm]):
 
     @checked
     def scaled(self, factor: NonNegative) -> "Cost":
-        """The cost times a number: a kind with a weight may override it, for the cost with another weight."""
+        """The cost times a number. Costs with a reference or obstacles have their own: the search changes weights."""
+        if self.state_reference is not None or self.control_reference is not None or self.kept_clear is not None:
+            raise InputError(f"{self.name}: got no method scaled, want it to return the cost times a number")
         return _ScaledCost(self, factor)
 
     def moved_to(self, state: Array, dynamics: Dynamics) -> "Cost":
@@ -346,9 +348,6 @@ class _OfCosts(Cost):
     def ahead(self, steps: int, *, horizon: str = "shrinking") -> Self:
         return self._of(term.ahead(steps, horizon=horizon) for term in self.terms)
 
-    def _at_other_knots(self, select: Callable[[Array], Array]) -> Self:
-        return self._of(term._at_other_knots(select) if term.by_knot else term for term in self.terms)
-
     def with_added_state(self, dynamics: Dynamics) -> Self:
         return self._of(term.with_added_state(dynamics) for term in self.terms)
 
@@ -386,41 +385,18 @@ class _ScaledCost(_OfCosts):
     """A cost times a number, for kinds that have no weight to change."""
 
     def __init__(self, cost: Cost, factor: float) -> None:
-        self.terms, self.factor, self._must_be_clear = (cost,), factor, cost._must_be_clear
+        self.terms, self._cost, self.factor = (cost,), cost, factor
 
     def _of(self, terms: Iterable[Cost]) -> "_ScaledCost":
         (cost,) = terms
         return _ScaledCost(cost, self.factor)
 
     @property
-    def _cost(self) -> Cost:
-        return self.terms[0]
-
-    @property
     def name(self) -> str:
         return self._cost.name
 
-    @property
-    def state_reference(self) -> "QuadraticCost | None":
-        return None if (reference := self._cost.state_reference) is None else reference.scaled(self.factor)
-
-    @property
-    def control_reference(self) -> "ControlCost | None":
-        return None if (reference := self._cost.control_reference) is None else reference.scaled(self.factor)
-
-    @property
-    def kept_clear(self) -> "KeepsClear | None":
-        return self._cost.kept_clear
-
-    @property
-    def contact_curvature(self) -> float:
-        return self.factor * self._cost.contact_curvature
-
     def off_place(self, dynamics: Dynamics, states: Array) -> dict[str, Array]:
         return self._cost.off_place(dynamics, states)
-
-    def moved_to(self, state: Array, dynamics: Dynamics) -> Cost:
-        return self._of([self._cost.moved_to(state, dynamics)])
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
         return self._cost.bind(dynamics).scaled(self.factor)
@@ -478,12 +454,6 @@ def goals_of(constraints: Sequence[Constraint], dynamics: Dynamics) -> dict[int,
     return goals
 
 
-def bind_all(constraints: Sequence[Constraint], dynamics: Dynamics, times: Array) -> tuple[ConstraintTerm, ...]:
-    """The constraints for a system and the times (T+1,) in s of the knots."""
-    _check_bounds([constraint.state_bounds(dynamics) for constraint in constraints], dynamics, len(times))
-    return terms_for(dynamics, times, constraints, ConstraintTerm, goals_of(constraints, dynamics))
-
-
 def terms_for(
     dynamics: Dynamics, times: Array, parts: Iterable[ProblemPart[Any]], kind: type[_BoundTerm],
     goals: Mapping[int, float] = MappingProxyType({}),
@@ -493,9 +463,10 @@ def terms_for(
     return tuple(check_kind(field, term, kind, f"a {kind.__name__}") for field, term in pairs)
 
 
-def _check_bounds(all_bounds: Sequence[Mapping[int, tuple[Side, Side]]], dynamics: Dynamics, knots: int) -> None:
+def check_bounds(constraints: Iterable[Constraint], dynamics: Dynamics, knots: int) -> None:
     """Raises InputError if a bound does not have a number for each knot, or those of a state leave nothing between."""
     names = dynamics.state_coordinates.names
+    all_bounds = [constraint.state_bounds(dynamics) for constraint in constraints]
     for i, sides in (item for bounds in all_bounds for item in bounds.items()):
         for side in sides:
             if isinstance(side, np.ndarray) and len(side) != knots:

@@ -4,7 +4,7 @@ import copy
 import itertools
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -37,7 +37,7 @@ from lqrsim.problem.parts import (
     Cost,
     CostSum,
     CostTerm,
-    bind_all,
+    check_bounds,
     goals_of,
     names_of,
     terms_for,
@@ -115,10 +115,7 @@ class FixedState:
         return self
 
 
-_Start = TypeVar("_Start", bound=Cost | FixedState)
-
-
-def _anywhere(start: _Start) -> _Start:
+def _anywhere(start: Any) -> Any:
     """A start that may be inside an obstacle."""
     start = copy.copy(start)
     keep(start, _must_be_clear=False)
@@ -242,7 +239,9 @@ class Problem(OneVersion):
             fields["_terms"][name] = terms_for(self.dynamics, self.times, parts, CostTerm)
         if constraints is not None:
             fields["constraints"] = tuple(constraints)
-            fields["constraint_terms"] = bind_all(constraints, self.dynamics, self.times)
+            check_bounds(constraints, self.dynamics, self.steps + 1)
+            goals = goals_of(constraints, self.dynamics)
+            fields["constraint_terms"] = terms_for(self.dynamics, self.times, constraints, ConstraintTerm, goals)
         return fields
 
     def from_state(self, state: npt.ArrayLike, *, after: int = 0, previous: npt.ArrayLike | None = None) -> "Problem":
@@ -400,30 +399,26 @@ class Problem(OneVersion):
     def goal(self) -> Array | None:
         """The state (n,) that the final cost and GoalStates specify; None if none of them does."""
         reference = self._only_reference(self.final_cost)
-        return self._with_goal_states(None if reference is None else reference.about)
+        goal = self._with_goal_states(np.nan if reference is None else reference.about)
+        return None if np.isnan(goal).any() else goal
 
     @property
     def weighed_goal(self) -> Array | None:
         """The goal, with NaN for states that have neither a weight nor a GoalState; None if all of it is NaN."""
         reference = self._only_reference(self.final_cost)
-        goal = np.full(len(self.dynamics.state_coordinates), np.nan)
-        if reference is not None:
-            goal = np.where(reference.weight.any(axis=1), reference.about, np.nan)
-        goal = self._with_goal_states(goal)
-        return None if goal is None or np.isnan(goal).all() else goal
+        weighed = np.nan if reference is None else np.where(reference.weight.any(axis=1), reference.about, np.nan)
+        goal = self._with_goal_states(weighed)
+        return None if np.isnan(goal).all() else goal
 
     def _only_reference(self, cost: Cost) -> QuadraticCost | None:
         """The reference of the only term of a cost that has one; None if none has, or several."""
         references = references_of(cost, self.dynamics)
         return references[0][1] if len(references) == 1 else None
 
-    def _with_goal_states(self, goal: Array | None) -> Array | None:
-        """The goal, completed by the GoalStates; None if some entries are still unknown."""
-        stated = goals_of(self.constraints, self.dynamics)
-        if goal is None and len(stated) < len(self.dynamics.state_coordinates):
-            return None
-        goal = np.zeros(len(stated)) if goal is None else goal.copy()
-        for i, number in stated.items():
+    def _with_goal_states(self, numbers: float | Array) -> Array:
+        """These numbers as a state (n,), with those of GoalStates in their place."""
+        goal = np.full(len(self.dynamics.state_coordinates), numbers)
+        for i, number in goals_of(self.constraints, self.dynamics).items():
             goal[i] = number
         return goal
 

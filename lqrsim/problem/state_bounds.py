@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Callable, Mapping, Sequence, Set
 from math import floor, inf
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -114,10 +114,8 @@ class StateBounds(Constraint):
         return other
 
     def state_bounds(self, dynamics: Dynamics) -> Mapping[int, tuple[Side, Side]]:
-        def sides(field: str, given: object) -> tuple[Side, Side]:
-            return given  # pyright: ignore[reportReturnType]
-
-        return dynamics.state_coordinates._by_name("StateBounds: states", self.bounds, sides)
+        space = dynamics.state_coordinates
+        return space._by_name("StateBounds: states", self.bounds, lambda _, sides: cast(tuple[Side, Side], sides))
 
     def with_added_state(self, dynamics: Dynamics) -> "StateBounds":
         names = dynamics.state_coordinates.names  # as for a GoalState

@@ -372,7 +372,7 @@ class MjcfRobot(Robot):
         effort = self.mjcf.efforts**-2.0 if effort is None else effort
         of_controls = effort if isinstance(effort, Mapping) else check_weights("effort", effort, len(controls))
         cost: Cost = ControlCost(of_controls, about=about)
-        state_weights, about_state, root = np.zeros(n), np.zeros(n), model.body_rootid[model.body(self.body).id]
+        state_weights, about_state, root = np.zeros(n), np.zeros(n), model.body_rootid[dynamics.physics.body]
         for joint in self.mjcf.joints:
             if joint.kind != "free":
                 state_weights[model.nv : 2 * model.nv][joint.dofs] = damping
@@ -493,6 +493,7 @@ class MjcfRobot(Robot):
             for joint in joints
             if joint.limits is not None and not joint.limits[0] <= rest_state[joint.dof] <= joint.limits[1]
         ]
+        without_floors = in_the_way(self.mjcf.model, self._candidates, self.dynamics.physics.body, floors=False)
         mounts = [
             f"{obstacle_of[obstacle]} ({self.mjcf.model.body(int(self.mjcf.model.geom_bodyid[mount])).name})"
             for mount, obstacle in mounting_pairs(self.mjcf.model, list(self.scene.geoms)).tolist()
@@ -513,15 +514,11 @@ class MjcfRobot(Robot):
             "past their limits at rest": past,
             "touching at rest": [" and ".join(pair) for pair in contacts_of(model, self.configuration(rest_state)[0])],
             "obstacles": list(self.scene.world.names) or ["none"],
-            "ground, which is no obstacle": self._ground(),
+            "ground, which is no obstacle": [
+                model.geom(geom).name for geom in without_floors if geom not in self.scene.geoms
+            ],
             "carried, without contacts, by": list(dict.fromkeys(mounts)),
         }
-
-    def _ground(self) -> list[str]:
-        """Names of the geoms that would be obstacles if `floors` were False."""
-        model = self.mjcf.model
-        avoidable = in_the_way(model, self._candidates, model.body(self.body).id, floors=False)
-        return [model.geom(geom).name for geom in avoidable if geom not in self.scene.geoms]
 
     @property
     def joint_limits(self) -> StateBounds:

@@ -28,6 +28,7 @@ import scipy.linalg
 
 from lqrsim.errors import Array
 from lqrsim.kernels.records import Motion
+from lqrsim.problem.mjcf_dynamics import MjcfDynamics
 from lqrsim.problem.problem import FixedState, Problem
 from lqrsim.results.solution_parts import ContactCertificate, Quadratic, Status
 from lqrsim.scenes.contacts import ContactModes, Period, Switches
@@ -399,7 +400,7 @@ def rolled_out(problem: Problem, states: Array, controls: Array, gain: Array) ->
 def keep_modes(run: SolveRun, result: RunResult) -> RunResult | None:
     """Descend from a plan within its contact modes; certified. None if no switch is near it, or known."""
     problem, dynamics = run.problem, run.problem.dynamics
-    modes = dynamics.contact_modes(problem.dt)
+    modes = dynamics.contact_modes(problem.dt) if isinstance(dynamics, MjcfDynamics) else None
     if modes is None or problem.constraints or problem.noise_term or not isinstance(problem.initial, FixedState):
         return None
     plan = CostedPlan(result.states.copy(), result.controls.copy(), result.cost)
