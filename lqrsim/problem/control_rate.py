@@ -166,13 +166,14 @@ class LastCommand(Dynamics):
     """Dynamics `of` a system, with the last command as their last m states."""
 
     def __init__(self, of: Dynamics) -> None:
-        self.of, self.level, self.functions = of, of.level, ()
+        self.of, self._name, self.level, self.functions = of, of.name, of.level, ()
         self.parameters, self.disturbances = dict[str, float](), dict[str, float]()  # those of `of` are its own
         # The steps are those of `of`, and so is what is told of them: its states come first.
         self._period, self.by_mujoco, self.rounding = of.period, of.by_mujoco, of.rounding
         self.period_near, self.check_period = of.period_near, of.check_period
         self.solving, self.quiet, self._with_finer_steps = of.solving, of.quiet, of._with_finer_steps
         self.touches, self.grazed, self._cause_of_failure = of.touches, of.grazed, of._cause_of_failure
+        self.untouched_body = of.untouched_body
         space, controls = of.state_coordinates, of.control_coordinates
         names = list(space.names)
         for name in controls.names:
@@ -182,10 +183,6 @@ class LastCommand(Dynamics):
             names=tuple(names), units=(*space.units, *controls.units), position=space.position, plane=space.plane,
             offset=space.offset, angles=space.angles, rotation_vectors=space.rotation_vectors,
         )  # fmt: skip
-
-    @property
-    def name(self) -> str:
-        return self.of.name
 
     @property
     def calling(self) -> Dynamics:
@@ -214,16 +211,12 @@ class LastCommand(Dynamics):
         """States (..., n) without the last command."""
         return np.asarray(states)[..., : len(self.of.state_coordinates)]
 
-    def untouched_body(self, states: Array, state: int) -> str:
-        return self.of.untouched_body(self._own(states), state) if state < len(self.of.state_coordinates) else ""
-
     def softened(self, states: Array) -> Iterator[tuple[str, Dynamics]]:
-        return ((name, LastCommand(softer)) for name, softer in self.of.softened(self._own(states)))
+        return ((name, LastCommand(softer)) for name, softer in self.of.softened(states))
 
     def approaches(self, states: Array, change: Array) -> Iterator[tuple[str, Dynamics, Array]]:
-        m = len(self.control_coordinates)
-        for words, dynamics, motion in self.of.approaches(self._own(states), self._own(change)):
-            yield words, LastCommand(dynamics), np.pad(motion, [(0, 0), (0, m)], constant_values=np.nan)
+        for words, dynamics, motion in self.of.approaches(states, change):
+            yield words, LastCommand(dynamics), motion
 
     def _runge_kutta(self, states: Array, controls: Array, dt: float) -> tuple[float, Array] | None:
         return self.of._runge_kutta(self._own(states), controls, dt)

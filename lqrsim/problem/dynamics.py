@@ -94,6 +94,8 @@ class Dynamics:
     rounding: float = 1e-13
     # Hash of the model that MuJoCo steps; empty for functions, which source and parameters define.
     model_digest: str = ""
+    # The name of dynamics that are not a function.
+    _name: str = ""
     # Runge-Kutta steps in a control period; see `with_substeps`.
     substeps: int = 1
 
@@ -173,7 +175,7 @@ class Dynamics:
 
     @property
     def name(self) -> str:
-        return name_of(self.f)
+        return self._name or name_of(self.f)
 
     @property
     def period(self) -> float | None:

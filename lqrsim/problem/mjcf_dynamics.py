@@ -65,8 +65,8 @@ class MjcfPhysics:
     Args:
       body: id of the body that is pushed. obstacles: ids of the geoms that are obstacles.
       unlimited: ids of the actuators and of the joints whose forces are not limited here.
-      softness: depth in m or rad over which the impedance of contacts and limits rises from zero; 0 for the MJCF's
-        impedance.
+      softness: least depth in m or rad over which the impedance of contacts and limits rises from zero; 0 for the
+        MJCF's impedance.
       loaded: whether bodies carry loads, point masses at their centres of mass, which are then among the numbers.
     """
 
@@ -92,7 +92,11 @@ class MjcfPhysics:
         model.actuator_forcelimited[list(self.unlimited[0])] = 0
         model.jnt_actfrclimited[list(self.unlimited[1])] = 0
         if self.softness > 0:
-            _soften(model, self.softness)
+            # By default `solimp` is "0.9 0.95 0.001": a contact that is just reached has 90 % of its impedance, so that
+            # a body which arrives at speed is stopped or not. If the impedance rises from zero, a step is continuous.
+            for solimp in (model.geom_solimp, model.pair_solimp, model.jnt_solimp, model.tendon_solimp_lim):
+                solimp[:, 0], solimp[:, 2] = 0.0, np.maximum(self.softness, solimp[:, 2])
+            option.o_solimp[0], option.o_solimp[2] = 0.0, max(self.softness, option.o_solimp[2])
         n, m = 2 * model.nv + model.na, model.nu
         self.team = np.zeros(8, dtype=np.int64)  # the words that the threads share
         self.team[kernel.TICKET] = n + m  # a job without columns left
@@ -170,17 +174,6 @@ class MjcfPhysics:
         return numbers.ctypes.data
 
 
-def _soften(model: mujoco.MjModel, width: float) -> None:
-    """Let the impedance of contacts and limits rise from zero, over at least this depth in m or rad.
-
-    By default `solimp` is "0.9 0.95 0.001": a contact that is just reached has 90 % of its impedance, so a body that
-    arrives at speed is either stopped or not. If the impedance rises from zero, a step is continuous.
-    """
-    for solimp in (model.geom_solimp, model.pair_solimp, model.jnt_solimp, model.tendon_solimp_lim):
-        solimp[:, 0], solimp[:, 2] = 0.0, np.maximum(width, solimp[:, 2])
-    model.opt.o_solimp[0], model.opt.o_solimp[2] = 0.0, max(width, model.opt.o_solimp[2])
-
-
 @cache
 def _functions() -> dict[int, float]:
     """The addresses of the functions that the kernel calls, by their indices: MuJoCo's, and one that yields, if any."""
@@ -245,10 +238,6 @@ class MjcfDynamics(Dynamics):
     @property
     def model_digest(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.physics.digest
-
-    @property
-    def name(self) -> str:
-        return self._name
 
     @cached_property
     def step_source(self) -> Source:

@@ -367,7 +367,13 @@ class Problem(OneVersion):
             if any(term.uses_control for term in self._terms[name]):
                 raise InputError(f"{name}: got a cost that depends on the control, want one of the state alone")
         self._check_duration()
-        self._check_between_knots()
+        formula = not self.dynamics.discrete and self.dynamics.level == "symbolic"
+        if self.accuracy is not None and (self.dynamics.discrete or self.dynamics.level == "jax"):
+            raise InputError(f"accuracy: got {self.accuracy:g} with dynamics whose steps have no parts, want None")
+        if self.between_knots and not formula:
+            raise InputError("between_knots: got True with dynamics that are not a formula, want False")
+        if self.between_knots and any(term.world.moving for term in self.kept_clear):
+            raise InputError("between_knots: got True with obstacles that move, want False")
         return self
 
     def _with(self, **changed: Any) -> "Problem":
@@ -549,15 +555,6 @@ class Problem(OneVersion):
             if stated is not None:
                 raise InputError(f"control_rate: got {self.control_rate!r} with {feature}, want one of the two")
         keep(self, control_rate=self.control_rate._in(self.dynamics))
-
-    def _check_between_knots(self) -> None:
-        formula = not self.dynamics.discrete and self.dynamics.level == "symbolic"
-        if self.accuracy is not None and (self.dynamics.discrete or self.dynamics.level == "jax"):
-            raise InputError(f"accuracy: got {self.accuracy:g} with dynamics whose steps have no parts, want None")
-        if self.between_knots and not formula:
-            raise InputError("between_knots: got True with dynamics that are not a formula, want False")
-        if self.between_knots and any(term.world.moving for term in self.kept_clear):
-            raise InputError("between_knots: got True with obstacles that move, want False")
 
     @checked
     def site_errors(self, states: Annotated[Array, "K n"]) -> dict[str, Array]:

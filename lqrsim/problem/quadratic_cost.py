@@ -106,19 +106,13 @@ class _SquareCost(Cost):
 
     def _ordered(self, space: Coordinates) -> tuple[Array, Array]:
         """Weight and reference, as `_checked`, with numbers by name in the order of the states or controls."""
-        weight = self._arguments["weight"]
-        if self.controls and isinstance(weight, Mapping):
-            weighed = space._by_name(f"{self.name}: weight", weight, _number_or_column)
-            missing = [name for i, name in enumerate(space.names) if i not in weighed]
-            if missing:
-                got = f"none for {', '.join(missing)}"
-                raise InputError(f"{self.name}: weight: got {got}, want one for each control")
-        fields = {
-            field: _by_name(space, f"{self.name}: {field}", given) if isinstance(given, Mapping) else given
-            for field, given in self._arguments.items()
-        }
-        if isinstance(weight, Mapping) and np.ndim(fields["weight"]) == 2:  # diagonals, one for each knot
-            fields["weight"] = fields["weight"][:, :, None] * np.eye(len(space))
+        fields: dict[str, Any] = dict(self._arguments)
+        for name, given in self._arguments.items():
+            if isinstance(given, Mapping):
+                of_each = self.controls and name == "weight"
+                fields[name] = _by_name(space, f"{self.name}: {name}", given, of_each=of_each)
+                if name == "weight" and fields[name].ndim == 2:  # diagonals, one for each knot
+                    fields[name] = fields[name][:, :, None] * np.eye(len(space))
         return self._checked(**fields)
 
     def bind(self, dynamics: Dynamics) -> CostTerm:
@@ -212,9 +206,13 @@ def _number_or_column(field: str, value: object) -> float | Array:
     return check_number(field, value)
 
 
-def _by_name(space: Coordinates, field: str, numbers: Mapping[str, object]) -> Array:
-    """Numbers by name or unit as an array (n,), with 0 for the rest; (K, n) if some have one number for each knot."""
+def _by_name(space: Coordinates, field: str, numbers: Mapping[str, object], *, of_each: bool) -> Array:
+    """Numbers by name or unit as an array (n,), with 0 for the rest, unless there must be none; (K, n) if some have one
+    number for each knot.
+    """
     entries = space._by_name(field, numbers, _number_or_column)
+    if of_each and (missing := [name for i, name in enumerate(space.names) if i not in entries]):
+        raise InputError(f"{field}: got none for {', '.join(missing)}, want one for each control")
     counts = {len(entry) for entry in entries.values() if isinstance(entry, np.ndarray)}
     if len(counts) > 1 or 0 in counts:
         got = " and ".join(map(str, sorted(counts)))

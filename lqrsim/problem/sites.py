@@ -75,12 +75,9 @@ class _OfSite:
     def off_place(self, dynamics: Dynamics, states: Array) -> dict[str, Array]:
         mjcf_dynamics = dynamics.calling
         assert isinstance(mjcf_dynamics, MjcfDynamics)
-        model, errors = mjcf_dynamics.physics.model, dict[str, Array]()
+        model, places = mjcf_dynamics.physics.model, {self.site: self.position, f"{self.site} turned": self.orientation}
         site, finite = model.site(self.site).id, np.isfinite(states).all(axis=1)
-        if self.position is not None:
-            errors[self.site] = np.full(len(states), np.nan)
-        if self.orientation is not None:
-            errors[f"{self.site} turned"] = np.full(len(states), np.nan)
+        errors = {name: np.full(len(states), np.nan) for name, place in places.items() if place is not None}
         positions, quaternion, turn = mjcf_dynamics.mjcf.qpos_of(states[finite, : model.nv]), np.zeros(4), np.zeros(3)
         for k, data in zip(np.flatnonzero(finite), posed(model, positions), strict=True):
             if self.position is not None:

@@ -68,11 +68,7 @@ class MjcfRobot(Robot):
     A cart-pole, from hanging to standing:
 
         robot = ls.MjcfRobot("cartpole.xml")
-        problem = ls.Problem(
-            dynamics=robot.dynamics, dt=0.02, steps=150, initial=ls.FixedState(robot.at(pole=np.pi)),
-            stage_cost=ls.ControlCost([0.1]), final_cost=ls.QuadraticCost(np.full(4, 100.0), about=robot.at()),
-        )
-        solution = ls.smooth(problem)
+        solution = ls.smooth(robot.problem(robot.at(pole=np.pi), robot.at()))
         rollout = ls.simulate(ls.Plant(robot, robot.scene), solution)
 
     The states are the positions of the joints in MuJoCo's order, then their velocities, then the states of actuators.
