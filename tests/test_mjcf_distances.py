@@ -732,7 +732,7 @@ def test_a_goal_inside_an_obstacle_is_found_where_positions_have_weights(seed: i
 def test_threads_that_ask_at_once_have_one_model_of_distances(threads: int, seed: int) -> None:
     """Whose address is that of a model that is kept: each thread is made to wait while it makes one."""
     physics, made = arm("capsule", "sphere", seed).dynamics.physics, list[Any]()
-    _ = physics.numbers
+    _ = physics.kernel_numbers
 
     def slow(thing: Any) -> Any:
         made.append(copy.copy(thing))
@@ -749,4 +749,4 @@ def test_threads_that_ask_at_once_have_one_model_of_distances(threads: int, seed
         patch.setattr(mjcf_dynamics, "copy", SimpleNamespace(copy=slow))
         addresses = list(pool.map(ask, range(threads)))
     assert len(set(addresses)) == len(made) == 1
-    assert physics.numbers[kernel.DISTANCE_MODEL] == made[0]._address
+    assert physics.kernel_numbers[kernel.DISTANCE_MODEL] == made[0]._address

@@ -48,7 +48,7 @@ def test_a_file_is_compiled_once_for_the_robot_and_its_plans_and_once_for_each_p
         robot = ls.MjcfRobot(arm)
         assert len(found) == 1
         problem = robot.problem(robot.at(), robot.at(turn=0.1), steps=5)
-        assert robot.dynamics.physics._numbers is None  # MuJoCo's memory is made at the solve
+        assert robot.dynamics.physics._kernel_numbers is None  # MuJoCo's memory is made at the solve
         solution = ls.smooth(problem, max_iterations=2)
         assert str(robot)
         assert len(found) == 1

@@ -101,7 +101,7 @@ class MjcfPhysics:
         self.team = np.zeros(8, dtype=np.int64)  # the words that the threads share
         self.team[kernel.TICKET] = n + m  # a job without columns left
         self._job = np.zeros(1 + (n + m) + n + 6 + n * (n + m))
-        self._numbers: Array | None = None
+        self._kernel_numbers: Array | None = None
         self._for_distances: mujoco.MjModel | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -115,12 +115,12 @@ class MjcfPhysics:
         return sha256(self.mjcf.xml, self.mjcf.turns_about or "", repr(changed))
 
     @property
-    def numbers(self) -> Array:
+    def kernel_numbers(self) -> Array:
         """Those for the kernel, without a wrench and loads; they have addresses in the memory, which is made here."""
         with _making:
-            if self._numbers is None:
-                self._numbers = self._with_memory()
-            return self._numbers
+            if self._kernel_numbers is None:
+                self._kernel_numbers = self._with_memory()
+            return self._kernel_numbers
 
     def _with_memory(self) -> Array:
         model, carriers = self.model, list(self.mjcf.carriers if self.loaded else ())
@@ -162,7 +162,7 @@ class MjcfPhysics:
         Its distances are more exact, so that their directions are gradients: with MuJoCo's tolerance of 1e-6 m,
         directions between geoms that nearly touch can be a few degrees off.
         """
-        numbers = self.numbers
+        numbers = self.kernel_numbers
         with _making:
             if self._for_distances is None:
                 self._for_distances = exact = copy.copy(self.model)
@@ -253,7 +253,7 @@ class MjcfDynamics(Dynamics):
 
     @property
     def data(self) -> Array:
-        numbers = self.physics.numbers.copy()
+        numbers = self.physics.kernel_numbers.copy()
         numbers[list(self.places.values())] = list(self.parameters.values())
         return numbers
 

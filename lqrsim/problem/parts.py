@@ -116,7 +116,7 @@ class CostTerm(Term):
     def scaled(self, factor: NonNegative) -> Self:
         """The term times a number, which is the last in its data: another number compiles nothing."""
         kernels = source_of(__name__, FACTOR=self.numbers)
-        kernels = kernels.filled(stated=(self.code, "value"), stated_derivatives=(self.code, "derivatives"))
+        kernels = kernels.filled(unscaled=(self.code, "value"), unscaled_derivatives=(self.code, "derivatives"))
         source = kernels.filled(value=(kernels, "scaled_value"), derivatives=(kernels, "scaled_derivatives"))
         return replace(self, source=source, data=np.append(self.data, factor))
 
@@ -558,19 +558,19 @@ def row_slope(residual, jacobian, t, row, data, gradient):
 
 # The kernels of a cost times a number, which `data` has at FACTOR; the cost itself is filled in.
 FACTOR = 0
-stated: Any = None
-stated_derivatives: Any = None
+unscaled: Any = None
+unscaled_derivatives: Any = None
 
 
 def scaled_value(x, u, t, data):
     """The cost."""
-    return data[FACTOR] * stated(x, u, t, data)
+    return data[FACTOR] * unscaled(x, u, t, data)
 
 
 def scaled_derivatives(x, u, t, data, hessian, gradient):
     """Add the Hessian (W, W) and the gradient (W,), and return the cost."""
     curve, slope = zeros(W, W), zeros(W)
-    total = stated_derivatives(x, u, t, data, curve, slope)
+    total = unscaled_derivatives(x, u, t, data, curve, slope)
     for i in range(W):
         gradient[i] += data[FACTOR] * slope[i]
         for j in range(W):

@@ -198,7 +198,12 @@ class Problem(OneVersion):
         self._checked_parts()
         if self.risk and self.noise is None:
             raise InputError(f"risk: got {self.risk:g} for a problem without noise, want noise=Noise(...), or 0")
-        self._check_rate()
+        if self.control_rate is not None:
+            others = {"noise": self.noise, "a free duration": self.duration, "accuracy": self.accuracy}
+            for feature, stated in (others | {"between_knots": self.between_knots or None}).items():
+                if stated is not None:
+                    raise InputError(f"control_rate: got {self.control_rate!r} with {feature}, want one of the two")
+            keep(self, control_rate=self.control_rate._in(self.dynamics))
         limited = controls = self.dynamics.control_coordinates
         if self.control_limits is not None:
             limited = controls.limited(self.control_limits)
@@ -547,15 +552,6 @@ class Problem(OneVersion):
         if why := next((why for why, stated in others.items() if stated), ""):
             raise InputError(f"duration: got {low:g} to {high:g} s with {why}, want None, or a problem without them")
 
-    def _check_rate(self) -> None:
-        if self.control_rate is None:
-            return
-        others = {"noise": self.noise, "a free duration": self.duration, "accuracy": self.accuracy}
-        for feature, stated in (others | {"between_knots": self.between_knots or None}).items():
-            if stated is not None:
-                raise InputError(f"control_rate: got {self.control_rate!r} with {feature}, want one of the two")
-        keep(self, control_rate=self.control_rate._in(self.dynamics))
-
     @checked
     def site_errors(self, states: Annotated[Array, "K n"]) -> dict[str, Array]:
         """How far sites are from where SiteCosts of the final cost and SiteConstraints want them.
@@ -604,7 +600,7 @@ class Problem(OneVersion):
             stated.append((wide, rollout.commanded, term, [f"ControlRate: {name}" for name in term.names]))
         for states, controls, term, names in stated:
             of_term: dict[str, Array] = {}
-            rows = _violated(term, states, controls, rollout.counts, EQUALITY_TOLERANCE)
+            rows = _violated(term, states, controls, rollout.counts)
             for name, (by, knots) in zip(names, rows, strict=True):
                 worst = np.stack([by, rollout.times[knots]], axis=1)
                 before = of_term.get(name, worst)
@@ -667,7 +663,7 @@ class PlainTerm:
 
 
 def _violated(
-    term: ConstraintTerm, states: Array, controls: Array, counts: npt.NDArray[np.bool_], tolerance: float
+    term: ConstraintTerm, states: Array, controls: Array, counts: npt.NDArray[np.bool_]
 ) -> Iterator[tuple[Array, npt.NDArray[np.intp]]]:
     """The largest violation (K,) of each run and its knot (K,), zeros for a run without one, row by row.
 
@@ -683,7 +679,7 @@ def _violated(
             t = int(knot) + knots.start
             value = plain.value(np.concatenate([states[k, t], controls[k, min(t, steps - 1)]]), row, t)
             missed = abs(value) if term.equality else -value
-            if missed > max(tolerance, largest[k]):
+            if missed > max(EQUALITY_TOLERANCE, largest[k]):
                 largest[k], when[k] = missed, t
         yield largest, when
 
