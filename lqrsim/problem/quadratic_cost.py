@@ -207,8 +207,8 @@ def _number_or_column(field: str, value: object) -> float | Array:
 
 
 def _by_name(space: Coordinates, field: str, numbers: Mapping[str, object], *, of_each: bool) -> Array:
-    """Numbers by name or unit as an array (n,), with 0 for the rest, unless there must be none; (K, n) if some have one
-    number for each knot.
+    """Numbers by name or unit as an array (n,), with 0 for the rest, or none left out with `of_each`; (K, n) if some
+    have one number for each knot.
     """
     entries = space._by_name(field, numbers, _number_or_column)
     if of_each and (missing := [name for i, name in enumerate(space.names) if i not in entries]):
