@@ -286,7 +286,7 @@ from lqrsim.stress.study import Shard
 class Job(campaign.Job):
     def prepare(self, **_):
         pass
-    def work(self, shard):
+    def work(self, shard, runner):
         return b""
 
 def interrupt(number):

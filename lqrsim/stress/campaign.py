@@ -115,7 +115,8 @@ def run_campaign(
 
     Args:
       folder: where everything is stored, the campaign's `solution` too.
-      workers: number of processes on this machine; by default one per processor. 0 runs everything in this process.
+      workers: number of processes on this machine, at most one per shard that is left; by default one per processor. 0
+        runs everything in this process.
       batch: number of trials that a worker simulates together; affects only time and memory.
       scheduler: address of a dask cluster that does the work instead of this machine, such as tcp://10.0.0.1:8786.
 
@@ -423,29 +424,25 @@ class Job:
     name: str = field(default_factory=lambda: f"lqrsim-{uuid.uuid4().hex}")
 
     def prepare(self, *, here: bool = False) -> TrialRunner:
-        """The runner of this job's trials, kept in this process until there is another job.
+        """Make the runner of this job's trials, with everything compiled.
 
         Raises InputError if this is the driver's machine, and the code of the scenario has changed meanwhile. Elsewhere
         the files of its meshes may be in other folders, so that it is not compared.
         """
-        if self.name not in _prepared:
-            _prepared.clear()
-            manifest, reference = self.manifest, self.manifest.settings.scenario
-            scenario = resolve(reference)
-            if here and (_digest_of_runs(scenario), scenario.problem.digest) != (manifest.model, manifest.problem):
-                got = f"a worker for which {reference} is another than the campaign's"
-                raise InputError(f"scenario: got {got}, want code that has not changed since the campaign was made")
-            runner = TrialRunner(Campaign.from_json(manifest.campaign, scenario), self.solutions)
-            warm_up(runner)
-            _prepared[self.name] = runner
-        return _prepared[self.name]
+        manifest, reference = self.manifest, self.manifest.settings.scenario
+        scenario = resolve(reference)
+        if here and (_digest_of_runs(scenario), scenario.problem.digest) != (manifest.model, manifest.problem):
+            got = f"a worker for which {reference} is another than the campaign's"
+            raise InputError(f"scenario: got {got}, want code that has not changed since the campaign was made")
+        runner = TrialRunner(Campaign.from_json(manifest.campaign, scenario), self.solutions)
+        warm_up(runner)
+        return runner
 
-    def work(self, shard: Shard, runner: TrialRunner | None = None) -> bytes:
-        """Run a shard in this process, with this runner if there is one. Returns its file.
+    def work(self, shard: Shard, runner: TrialRunner) -> bytes:
+        """Run a shard in this process. Returns its file.
 
         It is simulated in batches. If a trial of a batch is an error, all its trials are run again one by one.
         """
-        runner = runner or self.prepare()
         cell, end = runner.campaign.cells[shard.cell_number], shard.first + shard.count
         parts: list[Columns] = []
         for first in range(shard.first, end, self.batch):
@@ -459,9 +456,6 @@ class Job:
     def errors(self, shard: Shard, reason: str) -> bytes:
         """The file of a shard that could not be run: each of its trials is an error with this reason."""
         return pack(_error_rows(shard.first, shard.count, reason), shard, self.manifest.digest)
-
-
-_prepared: dict[str, TrialRunner] = {}  # of the last job that this process worked for
 
 
 def warm_up(runner: TrialRunner) -> None:
@@ -628,13 +622,13 @@ def _serve(connection: Connection) -> None:
         return
     with contextlib.suppress(EOFError, OSError):
         try:
-            job.prepare(here=True)
+            runner = job.prepare(here=True)
         except InputError as error:
             connection.send(error)
             return
         connection.send("ready")
         while True:
-            connection.send(job.work(connection.recv()))
+            connection.send(job.work(connection.recv(), runner))
 
 
 def _end_with_parent() -> None:
@@ -764,11 +758,17 @@ def _silenced() -> Iterator[None]:
             logger.disabled = False
 
 
+_prepared: dict[str, TrialRunner] = {}  # of the last job of which this process got a task
+
+
 def _run_on_worker(job: Job, shard: Shard) -> bytes:
-    """Run a shard in a worker, one at a time."""
+    """Run a shard in a worker, one at a time. Tasks of dask share nothing else, so that the runner is kept here."""
     from distributed import get_worker
 
     with _one_at_a_time:
         worker = get_worker()
         worker.log_event(job.name, [worker.address, [shard.cell_number, shard.first, shard.count]])
-        return job.work(shard)
+        if job.name not in _prepared:
+            _prepared.clear()
+            _prepared[job.name] = job.prepare()
+        return job.work(shard, _prepared[job.name])

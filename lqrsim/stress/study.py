@@ -341,7 +341,7 @@ class Campaign(Setup):
         for the disturbances of each cell, which no single policy knows. By default the first four.
       trials: number of trials for each sweep, strength and policy.
       replan_every: seconds between two solves of replan; by default a tenth of the horizon.
-      shard: trials per file; an interruption loses at most this many per worker.
+      shard: trials per file, which one worker runs; an interruption loses at most this many per worker.
       time_limit: seconds after which a shard counts as hung and its trials as errors.
     """
 
