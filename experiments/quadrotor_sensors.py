@@ -72,10 +72,10 @@ def main(config: Config) -> Result:
     with tempfile.TemporaryDirectory() as folder, counting("quadrotor on sensors") as told:
         results = ls.stress.run_campaign(campaign, folder, workers=0, progress=told)
         rows = []
-        for cell in results.cells:
-            success, tally = results.outcomes(cell).success, results.tally(cell)
-            failures = {how: tally[how] for how in FAILURES}
-            rows.append({"cell": cell.sweep, "reached": interval(success.exact)} | failures)
+        for cell, summary in results.cell_summaries().items():
+            assert summary.success is not None
+            failures = {how: summary.tally[how] for how in FAILURES}
+            rows.append({"cell": cell.sweep, "reached": interval(summary.success.exact)} | failures)
     return opening(config) | {"rows": rows} | {"estimates": estimates(config)}
 
 

@@ -165,7 +165,7 @@ def report(
 
 
 def _text_and_tables(
-    results: Results, table: analysis.Table, broken: Breaks, worst: Sequence[list[analysis.Trial]]
+    results: Results, table: analysis.OutcomesByCell, broken: Breaks, worst: Sequence[list[analysis.Trial]]
 ) -> dict[str, Any]:
     campaign, scenario = results.campaign, results.runner.scenario
     unit = tracking_unit(scenario.problem.dynamics.state_coordinates)
@@ -176,8 +176,8 @@ def _text_and_tables(
     if erred:
         warnings.append(f"{erred} trials ended with an error; they count as failures.")
     warnings += [f"{line}." for line in results.came_to_nothing()]
-    target = next(iter(results.runner.solutions.values())).target
-    radius = scenario.target_radius(campaign.goal_radius, campaign.goal_tolerance, target=target)
+    first = campaign.policies[0]
+    target, radius = results.solution(first).target, results.goal_radius(first)
     return {
         "title": f"Stress test of {scenario.name}",
         "warnings": warnings,
@@ -196,7 +196,7 @@ def _text_and_tables(
     }
 
 
-def _facts(results: Results, table: analysis.Table) -> dict[str, list[str]]:
+def _facts(results: Results, table: analysis.OutcomesByCell) -> dict[str, list[str]]:
     campaign, manifest, scenario = results.campaign, results.manifest, results.runner.scenario
     problem = scenario.problem
     facts = {
@@ -232,7 +232,7 @@ def _describe(disturbances: Sequence[Disturbance], scenario: Scenario) -> str:
     return "; ".join(disturbance.describe(plant) for disturbance in disturbances) or "none"
 
 
-def _sweep(name: str, results: Results, table: analysis.Table, folder: Path) -> dict[str, Any]:
+def _sweep(name: str, results: Results, table: analysis.OutcomesByCell, folder: Path) -> dict[str, Any]:
     scenario = results.runner.scenario
     unit = tracking_unit(scenario.problem.dynamics.state_coordinates)
     of_sweep = {cell: outcomes for cell, outcomes in table.items() if cell.sweep == name}
@@ -288,7 +288,7 @@ def policies(table: Iterable[Cell]) -> list[str]:
     return list(dict.fromkeys(cell.policy for cell in table))
 
 
-def breaks_table(table: analysis.Table, broken: Breaks) -> PageTable:
+def breaks_table(table: analysis.OutcomesByCell, broken: Breaks) -> PageTable:
     """The strength at which each policy breaks in each sweep."""
     rows = list[list[str]]()
     for policy, sweep, cell in broken:
@@ -303,7 +303,7 @@ def _percent(rate: Estimate, unit: str = " %") -> str:
     return f"{100 * rate.value:.1f}{interval}{unit}"
 
 
-def comparison_tables(table: analysis.Table, unit: str) -> list[PageTable]:
+def comparison_tables(table: analysis.OutcomesByCell, unit: str) -> list[PageTable]:
     """Pairs of policies on the same trials, a table for each pair and sweep; `unit` is the unit of tracking errors."""
     factor, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
     head = (
@@ -327,7 +327,7 @@ def _between(value: float, low: float, high: float, scale: float = 1.0) -> str:
     return f"{scale * value:.3g}" if low == high else f"{scale * value:.3g} ({scale * low:.3g} to {scale * high:.3g})"
 
 
-def failure_table(table: analysis.Table) -> PageTable:
+def failure_table(table: analysis.OutcomesByCell) -> PageTable:
     """The numbers of failures of each kind in each cell, and the obstacles that were hit."""
     kinds = [outcome for outcome in OUTCOMES if outcome != "reached"]
     rows = []
@@ -345,7 +345,7 @@ def failure_table(table: analysis.Table) -> PageTable:
     return PageTable("Failures by how they ended, and the obstacles that were hit most", head, rows)
 
 
-def measure_tables(table: analysis.Table, scenario: Scenario, target: Target) -> list[PageTable]:
+def measure_tables(table: analysis.OutcomesByCell, scenario: Scenario, target: Target) -> list[PageTable]:
     """Quantiles of all measures, a table for each sweep."""
     units = dict(analysis.MEASURES)
     of_controls = set(scenario.robot.dynamics.control_coordinates.units)
@@ -381,7 +381,7 @@ def worst_table(worst: Sequence[list[analysis.Trial]], unit: str) -> PageTable:
     return PageTable("Worst trials", head, rows)
 
 
-def success_table(sweep: str, table: analysis.Table) -> PageTable:
+def success_table(sweep: str, table: analysis.OutcomesByCell) -> PageTable:
     """The numbers of trials of each policy that reached the goal in a sweep, a row for each strength."""
 
     def entry(cell: Cell) -> str:

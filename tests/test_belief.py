@@ -496,7 +496,7 @@ def test_a_campaign_and_a_figure_of_plans_in_belief_space(tmp_path: Path) -> Non
     run = ls.simulate(scenario.plant(), controller=law, trials=20, frames=False, contacts=False, **options)
     found = results.outcomes(cell)
     assert found.outcome.tolist() == list(run.outcome)
-    assert 0 < results.tally(cell)["reached"] < 20
+    assert 0 < results.cell_summaries()[cell].tally["reached"] < 20
     assert "loss 0.2" in " ".join(run.disturbances)
     whole = found.outcome != "collided"
     np.testing.assert_array_equal(found.goal[whole], run.goal_distance[whole])

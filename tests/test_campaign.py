@@ -162,7 +162,7 @@ def test_rows_are_those_of_one_rollout(reference: Results, quadrotor: ls.Scenari
     )  # fmt: skip
     assert table.trial.tolist() == list(range(18))
     assert tuple(table.outcome) == rollout.outcome
-    assert reference.tally(cell).total() == 18
+    assert reference.cell_summaries()[cell].tally.total() == 18
     assert reference.complete
     assert reference.campaign == CAMPAIGN
 
@@ -407,7 +407,7 @@ def test_an_exception_costs_its_own_trials_only(own: Path, tmp_path: Path) -> No
     said = f"RuntimeError: two lines ({own.name}, line {line_of('raise RuntimeError')})"
     assert set(reasons.values()) == {said}
     assert sorted(reasons) == np.flatnonzero(table.outcome == "error").tolist()
-    assert results.tally(cell)["reached"] == 24 - len(reasons)
+    assert results.cell_summaries()[cell].tally["reached"] == 24 - len(reasons)
     assert np.isnan(table.worst[sorted(reasons)]).all()
     assert f"{len(reasons)} trials were stopped: {said}" in results.summary()
 
@@ -452,7 +452,7 @@ def test_what_hangs_or_kills_its_worker_costs_its_shard(
             assert all(reason.startswith(says) for reason in table["reason"].tolist())
         else:
             assert all(table[name].tobytes() == good[name].tobytes() for name in ("trial", "worst", "cost"))
-    assert 0 < results.tally(cell)["error"] < 24
+    assert 0 < results.cell_summaries()[cell].tally["error"] < 24
 
 
 def test_a_policy_that_returns_nan_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -474,17 +474,18 @@ def test_a_policy_that_returns_nan_is_an_error(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(TrialRunner, "controller", mad)
     results = run_campaign(CAMPAIGN, tmp_path, workers=0)
     nan = Cell("open_loop", "scenario", 1.0)
-    assert results.tally(nan)["error"] > 15  # the others collide before
-    assert results.tally(nan)["error"] + results.tally(nan)["collided"] == 18
+    tally = results.cell_summaries()[nan].tally
+    assert tally["error"] > 15  # the others collide before
+    assert tally["error"] + tally["collided"] == 18
     assert set(results.reasons(nan).values()) == {"controller at 0.6667 s: got nan for rotor_1, want a finite number"}
-    assert results.tally(Cell("smooth", "scenario", 1.0))["reached"] > 13
+    assert results.cell_summaries()[Cell("smooth", "scenario", 1.0)].tally["reached"] > 13
 
 
 def test_a_simulation_that_blows_up_is_diverged(tmp_path: Path) -> None:
     campaign = replace(CAMPAIGN, sweeps={"storm": (ForceNoise(1e12),)}, trials=8)
     results = run_campaign(campaign, tmp_path, workers=0)
     for cell in results.cells:
-        assert results.tally(cell) == {"diverged": 8}
+        assert results.cell_summaries()[cell].tally == {"diverged": 8}
 
 
 # What goes wrong with the folder.
@@ -839,7 +840,7 @@ def test_stress_and_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     results = Results(folder)
     printed = capsys.readouterr().out
     for cell in results.cells:
-        assert f"{results.tally(cell)['reached']}/18" in printed
+        assert f"{results.outcomes(cell).outcome.tolist().count('reached')}/18" in printed
     assert f"wrote {folder}" in printed
     cell = results.cells[1]
     collided = int(np.flatnonzero(results.outcomes(cell).outcome == "collided")[0])
@@ -935,7 +936,7 @@ def test_a_file_does_not_choose_what_code_runs(own: Path, tmp_path: Path, capsys
     campaign = troubled(own, "none")
     run_campaign(replace(campaign, trials=2), tmp_path, workers=0)
     results = Results(tmp_path)
-    assert results.tally(results.cells[0]).total() == 2
+    assert results.cell_summaries()[results.cells[0]].tally.total() == 2
     with pytest.raises(InputError, match="which runs only with --scenario"):
         replay(results, results.cells[0], 0)
     assert replay(Results(tmp_path, scenario=campaign.scenario), results.cells[0], 0).trials == 1

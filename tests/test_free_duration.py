@@ -413,7 +413,7 @@ def test_commands_run_a_plan_in_the_duration_that_it_found(tmp_path: Path, monke
     few = ["--trials", "2", "--strengths", "1", "--sweep", "scenario", "--workers", "0"]
     assert cli.main(["stress", "hurried.py:hurried", *policies, *few]) == 0
     results = ls.stress.Results("runs/stress/hurried", scenario="hurried.py:hurried")
-    assert all(results.tally(cell)["reached"] == 2 for cell in results.cells)
+    assert all(results.cell_summaries()[cell].tally["reached"] == 2 for cell in results.cells)
     reliability = ls.stress.ReliabilityProblem("hurried.py:hurried", solution="runs/hurried/solution.npz")
     assert reliability.score.plant.substeps(dt) == round(np.ceil(dt / physics))
 

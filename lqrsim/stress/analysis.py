@@ -180,7 +180,7 @@ def outcomes(
     )
 
 
-Table = Mapping[Cell, Outcomes]
+OutcomesByCell = Mapping[Cell, Outcomes]
 
 
 @checked
@@ -189,7 +189,7 @@ def succeeded(outcomes: Outcomes) -> npt.NDArray[np.bool_]:
     return outcomes.outcome == "reached"
 
 
-def _checked_table(table: Table) -> Table:
+def _checked_table(table: OutcomesByCell) -> OutcomesByCell:
     known = isinstance(table, Mapping) and all(isinstance(cell, Cell) for cell in table)
     if not known or not all(isinstance(outcomes, Outcomes) for outcomes in table.values()):
         raise InputError(f"table: got {excerpt(table)}, want a mapping from Cell to Outcomes")
@@ -198,7 +198,7 @@ def _checked_table(table: Table) -> Table:
 
 @checked
 def breaks(
-    table: Table, *, below: Annotated[float, Bounds(above=0.0, at_most=1.0)] = 0.95
+    table: OutcomesByCell, *, below: Annotated[float, Bounds(above=0.0, at_most=1.0)] = 0.95
 ) -> list[tuple[str, str, Cell | None]]:
     """Where each policy breaks in each sweep, the weakest first.
 
@@ -229,7 +229,7 @@ class Comparison:
     adjusted: float  # p-value, adjusted for the number of comparisons
 
 
-def comparisons(table: Table) -> list[Comparison]:
+def comparisons(table: OutcomesByCell) -> list[Comparison]:
     """Compare the first policy of the table with each other policy, for every sweep and strength that both have.
 
     Differences are paired by trial. Differences of success have Tango's score interval, differences of errors
@@ -245,7 +245,7 @@ def comparisons(table: Table) -> list[Comparison]:
 
 
 def compare_cells(
-    pairs: Iterable[tuple[Cell, Cell]], firsts: Table, seconds: Table, *, paired: bool = True
+    pairs: Iterable[tuple[Cell, Cell]], firsts: OutcomesByCell, seconds: OutcomesByCell, *, paired: bool = True
 ) -> list[Comparison]:
     """Compare pairs of cells, with p-values adjusted for their number (Holm).
 
@@ -315,7 +315,7 @@ class Trial:
 
 
 @checked
-def worst(table: Table, count: Count = 10) -> list[Trial]:
+def worst(table: OutcomesByCell, count: Count = 10) -> list[Trial]:
     """The worst trials of all cells, ranked as RANKING says."""
     ranked: list[tuple[tuple[float, ...], Trial]] = []
     for cell, outcomes in _checked_table(table).items():

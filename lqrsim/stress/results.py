@@ -124,21 +124,20 @@ class Results:
     @checked
     def outcomes(self, cell: Cell, *, partial: bool = False) -> Outcomes:
         """The outcomes of a cell's trials, in order; with `partial` also if the cell is not finished."""
-        shards = self._to_read(cell, partial)
-        tables = [self.table(shard) for shard in shards]
-        if not tables:
+        if not (shards := self._to_read(cell, partial)):
             raise InputError(f"cell: got {cell}, of which no trial has been run, want one that was begun")
+        found, self._summaries[cell] = self._read(cell, shards)
+        return found
+
+    def _read(self, cell: Cell, shards: list[Shard]) -> tuple[Outcomes, CellSummary]:
+        """The outcomes in these shards of a cell, and their summary."""
+        tables = [self.table(shard) for shard in shards]
         names = [name for name in tables[0] if name != "reason"]
         columns: dict[str, Any] = {name: np.concatenate([table[name] for table in tables]) for name in names}
         deterministic = not cell.strength or [cell.sweep, cell.strength] in self.manifest.deterministic
         found = Outcomes(**columns, deterministic=deterministic)
         reasons = Counter(reason for table in tables for reason in table["reason"].tolist() if reason)
-        self._summaries[cell] = CellSummary(shards, Counter(found.outcome.tolist()), reasons, found.success)
-        return found
-
-    def tally(self, cell: Cell, *, partial: bool = False) -> Counter[str]:
-        """The number of trials of each outcome of a cell, which need not be finished if `partial`."""
-        return Counter(end for table in self.tables(cell, partial=partial) for end in table["outcome"].tolist())
+        return found, CellSummary(shards, Counter(found.outcome.tolist()), reasons, found.success)
 
     def cell_summaries(self) -> dict[Cell, CellSummary]:
         """The summary of each cell. Shards never change, so they are read again only if there are others."""
@@ -146,7 +145,7 @@ class Results:
             if not (shards := self._to_read(cell, partial=True)):
                 self._summaries[cell] = CellSummary([], Counter(), Counter(), None)
             elif cell not in self._summaries or self._summaries[cell].shards != shards:
-                self.outcomes(cell, partial=True)
+                self._summaries[cell] = self._read(cell, shards)[1]
         return {cell: self._summaries[cell] for cell in self.cells}
 
     def summary(self) -> str:
@@ -242,19 +241,23 @@ class Results:
 
     def plans(self) -> list[str]:
         """Lines that say where the plan of each policy ends, and whether it misses the goal."""
-        settings, lines = self.manifest.settings, []
-        for policy in self.manifest.policies:
-            solution = self.solution(policy)
-            goal, radius = (settings.goal_radius, settings.goal_tolerance), solution.goal_radius
-            radius = radius if goal == (None, None) else solution.target.radius(None, *goal)
-            lines += [f"{policy}: {line}" for line in solution.target.of_plan(radius)]
-        return lines
+        return [
+            f"{policy}: {line}"
+            for policy in self.manifest.policies
+            for line in self.solution(policy).target.of_plan(self.goal_radius(policy))
+        ]
+
+    def goal_radius(self, policy: str) -> float | None:
+        """The distance within which the goal of a policy's plan counts as reached, in `Target.unit`."""
+        settings, solution = self.manifest.settings, self.solution(policy)
+        goal = settings.goal_radius, settings.goal_tolerance
+        return solution.goal_radius if goal == (None, None) else solution.target.radius(None, *goal)
 
     def reasons(self, cell: Cell) -> dict[int, str]:
         """The reasons of a cell's trials that ended with an error or diverged, by number of the trial."""
         return {
             int(trial): str(reason)
-            for table in self.tables(cell, partial=True)
+            for table in map(self.table, self._to_read(cell, partial=True))
             for trial, reason in zip(table["trial"], table["reason"], strict=True)
             if reason
         }
@@ -295,11 +298,6 @@ class Results:
         if shard.cell_number > (last := len(self.cells) - 1):
             raise InputError(f"shard: cell: got {shard.cell_number}, want a whole number from 0 to {last}")
         return self.folder / "shards" / shard.file
-
-    @checked
-    def tables(self, cell: Cell, *, partial: bool = False) -> Iterator[Columns]:
-        """The tables of a cell, shard by shard: name -> column. If `partial`, shards that are missing are skipped."""
-        yield from map(self.table, self._to_read(cell, partial))
 
     def _to_read(self, cell: Cell, partial: bool) -> list[Shard]:
         return [shard for shard in self.shards(cell) if not partial or self.path(shard).is_file()]
@@ -347,7 +345,7 @@ def replay(
       contacts: whether obstacles stop the robot.
     """
     results = results if isinstance(results, Results) else Results(results)
-    results.number(cell)
+    results.number(cell)  # raises InputError unless the campaign has it
     last = results.manifest.settings.trials - 1
     if trial + trials - 1 > last:
         raise InputError(f"trial: got {trial} to {trial + trials - 1}, want numbers up to {last}")
