@@ -1,6 +1,7 @@
 """Wind and currents in the fluid of an MJCF: its velocity, on every body on which MuJoCo's fluid forces act."""
 
 import copy
+import itertools
 from pathlib import Path
 
 import mujoco
@@ -152,3 +153,24 @@ def test_a_wind_of_ones_own_blows_too(swimmer: ls.MjcfRobot) -> None:
     plan = track(swimmer, swimmer.at(), np.zeros((5, 2)), DT, feedback=False)
     own, ours = (ls.simulate(plant, plan, disturbances=[one]) for one in (_Stream(), MeanWind((0.3, 0.0, 0.0))))
     np.testing.assert_array_equal(own.states, ours.states)
+
+
+class _Dragged(ls.MjcfRobot):
+    drag = 0.4
+
+
+class _Rising(ls.disturbances.Disturbance):
+    def start(self, plant, plan, generators) -> Effect:
+        speeds = itertools.count(1.0)
+        return Effect(wind=lambda step, states: np.full((len(states), 3), next(speeds)))
+
+
+@pytest.mark.parametrize("density", [0.0, 1.2])
+def test_a_wind_that_remembers_blows_once_in_a_period(tmp_path: Path, density: float) -> None:
+    """By a drag alone, and where a fluid is beside it."""
+    numbers = {"density": density, "viscosity": 0.0, "radius": 0.1, "mass": 4.0, "shape": "", "more": ""}
+    (tmp_path / "sphere.xml").write_text(SPHERE.format(**numbers))
+    robot = _Dragged(tmp_path / "sphere.xml")
+    plan = track(robot, [0.0, 0.0], np.zeros((STEPS, 1)), DT, feedback=False)
+    rollout = ls.simulate(ls.Plant(robot, robot.scene), plan, disturbances=[_Rising()])
+    np.testing.assert_array_equal(rollout.forces[0], 0.4 * np.tile(np.arange(1.0, STEPS + 1), (3, 1)).T)

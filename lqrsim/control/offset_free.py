@@ -131,11 +131,12 @@ def check_observable(model: PlanModel) -> None:
 class FilterLaw:
     """A filter with the law that acts on its estimates, about one plan."""
 
-    plan: Plan
+    solution: Plan  # whose trajectory is the model's plan
     model: PlanModel
     filter: KalmanFilter
     tracking: DeviationLaw
     planned_unknowns: Array | float = 0.0  # their states (D,) with which the plan was made
+    begins_at: int = 0  # step of a run at which its plan begins
 
     @cached_property
     def absolute(self) -> Policy:
@@ -155,11 +156,11 @@ class FilterRun(ControllerRun):
     """A run of `OffsetFree` with K trials: their estimates z (K, Z) at the knot of the newest measurement.
 
     If measurements are late by k periods, the filter runs k periods behind. Its estimate is predicted forward with the
-    commands since, to the time at which the next command acts. The law's plan begins at the step `begins_at`.
+    commands since, to the time at which the next command acts.
     """
 
     def __init__(self, law: FilterLaw, trials: int, record: bool) -> None:
-        self.law, self.begins_at = law, 0
+        self.law = law
         self.model = law.model  # for predictions, independent of a later plan's assumptions about the unknowns
         self._trials = trials
         self.z = np.tile(law.nominal[0], (trials, 1))
@@ -168,7 +169,7 @@ class FilterRun(ControllerRun):
         self._limit_factors = np.ones(trials)  # factors on the limits of corrections; see `kernels/feedback.py`
         shape, sizes = (law.model.plan.steps + 1, trials), (law.model.size, law.model.sensor.size)
         self.estimates, self.innovations = (np.full((*shape, size), np.nan) if record else None for size in sizes)
-        self._limits = Limits(*law.plan.policy.control_coordinates.limits)
+        self._limits = Limits(*law.solution.policy.control_coordinates.limits)
         self._turning = turning_of(law.model.dynamics.state_coordinates)
         self._latency, self._delay = law.model.uncertainty.latency, law.model.uncertainty.delay
         # Commands since the knot of z, the oldest first. Until the first ones arrive, the plan's are applied.
@@ -190,7 +191,7 @@ class FilterRun(ControllerRun):
         if step > self._latency:
             self._predict(self.z, self._commands.pop(0))
         # After the horizon the last gain stays in force.
-        knot = min(step - self.begins_at - self._latency, law.model.plan.steps)
+        knot = min(step - law.begins_at - self._latency, law.model.plan.steps)
         lost = np.isnan(measured).all(axis=1).astype(np.float64)
         model.compiled.correct(
             self._trials, in_c_order(measured), lost, in_c_order(law.model.plan.states[knot]),
@@ -209,7 +210,7 @@ class FilterRun(ControllerRun):
             predicted = predicted.copy()
             for command in self._commands:
                 self._predict(predicted, command)
-        t = min(step - self.begins_at + self._delay, law.model.plan.steps - 1)
+        t = min(step - law.begins_at + self._delay, law.model.plan.steps - 1)
         out = np.empty((self._trials, self.model.m))
         nominal = in_c_order(law.model.plan.states[t])
         at_step = Policy(law.absolute.gain[t], law.absolute.offset[t])
@@ -306,7 +307,6 @@ class OffsetFree(Controller):
         of_mjcf, of_states = (sensors, None) if isinstance(sensors, RobotSensors) else (None, sensors)
         sensor = sensor_of(of_states, problem.dynamics.state_coordinates)
         efforts = effort_of(effort, problem.dynamics)
-        uncertainty.check(problem.dynamics)
         derivatives = PlanDerivatives(problem.dynamics, plan, sensor)
         model = assumed_model(derivatives, uncertainty, memory, efforts)
         check_observable(model)
@@ -380,7 +380,6 @@ class OffsetFree(Controller):
         self._check_in_advance("loop")
         stated = self.uncertainty if uncertainty is None else uncertainty
         check_kind("uncertainty", stated, Uncertainty, "an Uncertainty, such as uncertainty_of(...), or None")
-        stated.check(self.problem.dynamics)
         truth = PlanModel(self.model.derivatives, stated.as_stated())
         offset = self.offset - self.solution.trajectory.controls
         offset = offset + np.einsum("tij,tj->ti", self.gain, self.nominal[:-1])
@@ -516,15 +515,15 @@ def linear_policy(law: FilterLaw) -> OutputFeedbackPolicy:
             transition[size:-m, size + m :] = np.eye(commands - m)
             by_command[-m:] = np.eye(m)
     return OutputFeedbackPolicy(
-        **arrays, dt=plan.dt, state_coordinates=law.plan.policy.state_coordinates,
-        control_coordinates=law.plan.policy.control_coordinates,
+        **arrays, dt=plan.dt, state_coordinates=law.solution.policy.state_coordinates,
+        control_coordinates=law.solution.policy.control_coordinates,
         measured_coordinates=_measured_coordinates(law),
     )  # fmt: skip
 
 
 def _measured_coordinates(law: FilterLaw) -> Coordinates:
     """Coordinates of the measured numbers: the coordinates of the states, if states are measured."""
-    space, names = law.plan.policy.state_coordinates, law.model.sensor.names
+    space, names = law.solution.policy.state_coordinates, law.model.sensor.names
     if not set(names) <= set(space.names):
         return Coordinates(names=names, units=("",) * len(names))
     chosen = [space.names.index(name) for name in names]
@@ -594,7 +593,7 @@ class ReplannedRun(ControllerRun):
     def _replan(self, run: FilterRun, trial: int, step: int) -> None:
         """Replace the law of a trial by a law about a new plan, if a new plan is needed and found."""
         law, model, z = run.law, run.model, run.z[0]
-        n, done = model.n, step - run.begins_at
+        n, done = model.n, step - law.begins_at
         # The unknowns' states that are constant to the end of the horizon and change only parameters.
         on_controls = (model.output[len(model.parameters) :] != 0).any(axis=0)
         modelled = (model.output != 0).any(axis=0) & ~on_controls
@@ -620,8 +619,8 @@ class ReplannedRun(ControllerRun):
         gain = in_c_order(gain[:, :, :n])
         if not self._always and self._leads_to_goal(problem, gain, offset, here):
             return
-        plan = law.plan
-        start = InitialGuess(gain, in_c_order(offset), cost_to_go=plan.shifted(done, horizon="shrinking").cost_to_go)
+        cost_to_go = law.solution.shifted(done, horizon="shrinking").cost_to_go
+        start = InitialGuess(gain, in_c_order(offset), cost_to_go=cost_to_go)
         sent = self._sent[trial] if problem.control_rate is not None else None
         solution = self._rule.solve(SolveRequest(step, step, here, start, problem, sent))
         if not self.log.record(step, trial, solution):
@@ -631,7 +630,7 @@ class ReplannedRun(ControllerRun):
         # The filter begins with a measurement that has been used already.
         kalman = kalman_filter(about, law.filter.corrected_root[done])
         weights = replace(law.tracking.weights, emphasis=None)  # that of another plan
-        run.law, run.begins_at = FilterLaw(solution, about, kalman, tracking_law(about, weights), planned), step
+        run.law = FilterLaw(solution, about, kalman, tracking_law(about, weights), planned, step)
 
 
 class Estimate(NamedTuple):

@@ -237,14 +237,11 @@ class Effects:
         self._arrived = np.tile(plan.states[0], (len(trials), 1))  # the last measurements that arrived
         self._measures, self._actuations = self._hooks("measure"), self._hooks("actuate")
         self._reads, self._kicks = self._hooks("read"), self._hooks("kick")
-        winds = [(slice(6, 9), 1.0)] if plant.has_medium else []
-        if plant.simulator is None or not plant.has_medium:  # an MJCF may have a drag beside its fluid
-            winds.append((slice(0, 3), plant.robot.drag))
-        # Label, hook, the entries of force, torque and wind, (9,) together, to which it adds, and a factor.
-        self._pushes = [(*hook, slice(3, 6), 1.0) for hook in self._hooks("torque")]
-        for named in self._effects:
-            self._pushes += [(*hook, slice(0, 3), 1.0) for hook in self._hooks("force", [named])]
-            self._pushes += [(*hook, *wind) for hook in self._hooks("wind", [named]) for wind in winds]
+        kinds = "torque", "force", "wind"
+        self._pushes = [(kind, *hook) for one in self._effects for kind in kinds for hook in self._hooks(kind, [one])]
+        self._has_medium = plant.has_medium
+        # An MJCF may have a drag beside its fluid; a simulator with a wind has its own.
+        self._drag = 0.0 if plant.has_medium and plant.simulator is not None else plant.robot.drag
 
     def _hooks(self, kind: str, effects: Sequence[tuple[str, Effect]] | None = None) -> list[tuple[str, Any]]:
         """The hooks of one kind, of all effects or these, each with its label for messages."""
@@ -289,8 +286,7 @@ class Effects:
         self.measure(step, states)
         for _, actuate in self._actuations:
             actuate(step, controls.copy())
-        for _, push, _, _ in self._pushes:
-            push(step, states)
+        self.push(step, states)
         for _, kick in self._kicks:
             kick(step, states, controls)
 
@@ -321,10 +317,14 @@ class Effects:
 
     def push(self, step: int, states: Array) -> tuple[Array, Array]:
         """Forces in N and torques in N m, (K, 6), and the wind in m/s, (K, 3), in world axes, at states (K, n)."""
-        pushed = np.zeros((len(states), 9))
-        for label, push, entries, factor in self._pushes:
-            pushed[:, entries] += factor * shaped(label, push(step, states), (len(states), 3))
-        return pushed[:, :6], pushed[:, 6:]
+        wrench, wind = np.zeros((len(states), 6)), np.zeros((len(states), 3))
+        sums = {"force": wrench[:, :3], "torque": wrench[:, 3:], "wind": wind}
+        for kind, label, push in self._pushes:
+            vector = shaped(label, push(step, states), wind.shape)
+            sums[kind] += vector
+            if kind == "wind":
+                sums["force"] += self._drag * vector
+        return wrench, wind if self._has_medium else np.zeros_like(wind)
 
     def kick(self, step: int, states: Array, controls: Array) -> Array | None:
         """The jump of the states at the end of a period, (K, n), for the applied controls; None for none."""

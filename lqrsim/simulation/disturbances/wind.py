@@ -63,7 +63,7 @@ class MeanWind(Wind):
         return MeanWind(np.add(self.velocity, other.velocity).tolist()) if isinstance(other, MeanWind) else None
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        """The wind as an unknown constant of mean zero, with the wind's size as std: its direction is unknown."""
+        """An unknown constant along each axis, of mean zero, with the size of the wind's part there as std."""
         winds = zip("xyz", self.velocity, strict=True)
         return self._unknowns(plant, [Unknown(f"wind_{axis}", abs(speed)) for axis, speed in winds])
 
