@@ -21,7 +21,8 @@ from lqrsim.errors import Array
 from lqrsim.results.goal import TOLERANCE
 from lqrsim.results.solution_parts import Status
 from lqrsim.scenarios.packaged import quadrotor_queries
-from lqrsim.solvers import budget
+from lqrsim.solvers import budget, smoother
+from lqrsim.solvers.settings import SmootherSettings
 
 PILLARS = [
     (0, -1.35), (1, -0.5), (-0.95, -0.5), (-0.2, 0.3), (0.8, 0.7), (1.1, 2.0), (-1.2, 0.8), (-1.1, 2.1), (-0.1, 1.6),
@@ -432,6 +433,30 @@ class TestProgress:
             assert solved(number, 0.001)[0] == []  # nothing is compiled
             assert solved(number + 0.125, None)[0] == []
             assert solved(number + 0.25, 5000.0)[0] == []  # a tenth of that is more than compiling takes
+
+    @pytest.mark.parametrize(("kind", "m"), [("soft start", 5), ("fixed start", 6), ("constraint", 7)])
+    def test_nothing_that_a_search_compiles_counts(
+        self, kind: str, m: int, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """For sizes that no other test has, and with an empty cache. What is compiled after the search may count."""
+        monkeypatch.setenv("LQRSIM_CACHE_DIR", str(tmp_path))
+        stop, compiled, counted = budget.Stop(), list[str](), list[str]()
+        compilations = SimpleNamespace(
+            append=lambda what: (counted if stop._stopped is None else compiled).append(what)
+        )
+        monkeypatch.setattr(compiled_module, "compilations", compilations)
+        dynamics = ls.Dynamics(
+            lambda x, u, p: [sum(u) - x[0] ** 3], states={"x": "m"}, controls={f"v{i}": "m/s" for i in range(m)}
+        )
+        problem = ls.Problem(
+            dynamics=dynamics, dt=0.1, steps=10, stage_cost=ls.ControlCost([1.0] * m),
+            initial=ls.QuadraticCost([1.0], about=[1]) if kind == "soft start" else ls.FixedState([1]),
+            final_cost=ls.QuadraticCost([5.0], about=[0]),
+            constraints=[ls.StateBounds(x=(-0.5, 2.0))] if kind == "constraint" else [],
+        )  # fmt: skip
+        assert smoother.solve(problem, SmootherSettings(), stop).success
+        assert len(compiled) > 3
+        assert not [what for what in counted if not what.startswith("state_jacobians ")]
 
     def test_whoever_hears_of_iterations_is_not_told(
         self, slow: ls.Problem, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture

@@ -45,7 +45,7 @@ class Stop:
     # Whether compiled code returns regularly, so that Ctrl-C ends it. If many problems are solved at once, it does not.
     attentive: bool = False
     deadline: float = np.inf
-    begun: float = np.nan
+    begun: float = field(default_factory=time.perf_counter)
     error: BaseException | None = None
     # Expected duration of the next iteration in s: an iteration that would end after the deadline is not begun. By
     # default it is the duration of the last iteration.
@@ -65,6 +65,9 @@ class Stop:
     @contextlib.contextmanager
     def not_counting(self) -> Iterator[None]:
         """A block that may compile, whose time does not count. If it compiles for long, a log line says so."""
+        if self._stopped is not None:  # within another
+            yield
+            return
         began, limit, compiled = time.perf_counter(), self.deadline - self.begun, len(compilations)
         self._stopped = began
         try:
@@ -76,6 +79,10 @@ class Stop:
             self.deadline += seconds
             if len(compilations) > compiled and np.inf > limit < NOTED * seconds:
                 _log.warning("compiled in %.1f s, which the time_limit of %g s does not count", seconds, limit)
+
+    @property
+    def elapsed(self) -> float:
+        return time.perf_counter() - self.begun
 
     @property
     def due(self) -> bool:

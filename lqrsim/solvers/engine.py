@@ -1,7 +1,6 @@
 """One run of the solver from one start: memory, smoothing, Newton's method at the end, and the safeguard."""
 
 import contextlib
-import time
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -31,7 +30,7 @@ from lqrsim.results.solution_parts import (
     joined,
 )
 from lqrsim.solvers import compiled
-from lqrsim.solvers.budget import ATTENTION, Budget, in_slices
+from lqrsim.solvers.budget import ATTENTION, Budget, Stop, in_slices
 from lqrsim.solvers.settings import INSIDE, InitialGuess, SmootherSettings
 from lqrsim.solvers.stages import Pool, Stages
 
@@ -195,7 +194,7 @@ class SolveRun:
         self.problem, self.settings, self.initial_guess, self.budget = problem, settings, initial_guess, budget
         kind = entry, compiled.core(problem, settings.form), problem.steps
         self.work = _pool.take(lambda idle: idle.kind == kind) or Workspace(problem, settings.form, entry)
-        self.work.begin(problem, settings, initial_guess, start)
+        self.work.begin(problem, settings, initial_guess, start, budget.stop)
         self.method = self.work.method
         self._stages: Stages | None = None
         self._rows, self._row = np.zeros(max(budget.left, 1), LOG), 0  # rows of smoothing, and the next row
@@ -529,11 +528,11 @@ class SolveRun:
             budget.record(Iteration(cost, improvement, gap, optimality, residual, missed, seconds, name))
             return stop.error is not None
 
-        ending, clock = Ending(declarations.RUNNING), time.perf_counter()
+        ending, clock = Ending(declarations.RUNNING), stop.elapsed
         slices = in_slices(run, rows[:last], watch, functions, attention, first=first)
         try:
             for (done, outcome, backward, failed), over in slices:
-                now = time.perf_counter()
+                now = stop.elapsed
                 stop.pace, clock = now - clock, now
                 if over or (outcome == declarations.RUNNING and done < last and stop.due):
                     outcome = declarations.TIMED_OUT
@@ -624,12 +623,15 @@ class Workspace:
     def compiled_call(self, module: CompiledModule, name: str, *arguments: Any) -> Call:
         """The call of a function, which is compiled if it is new; its arguments are laid out once."""
         if name not in self._calls:
-            self._calls[name] = module.lay_out(name, *arguments)
+            with self._stop.not_counting():  # compiling
+                self._calls[name] = module.lay_out(name, *arguments)
         return self._calls[name]
 
-    def begin(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
+    def begin(
+        self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, stop: Stop
+    ) -> None:
         """Begin a solve. The memory may have served another solve of the same size and number of steps."""
-        self._problem, steps = problem, problem.steps
+        self._problem, self._stop, steps = problem, stop, problem.steps
         self.method = method = settings.method(problem)
         self.priced, self.fixed = np.isfinite(method.price), isinstance(problem.initial, FixedState)
         self.prior, self.prior_iterations = self.no_prior, 0

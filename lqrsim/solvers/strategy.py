@@ -640,7 +640,9 @@ class Approaches:
         states, controls, end, goal = best.states, best.controls, best.states[-1], problem.goal
         sizes = np.maximum(np.ptp(states, axis=0), 0.0 if goal is None else np.abs(np.nan_to_num(goal - end)))
         sizes = np.where(sizes > 0, sizes, 1.0)
-        missed = np.abs(_final_cost(problem, end)[1]) * sizes > MOST_OF * abs(best.cost)
+        with self._stop.not_counting():  # compiling
+            slope = _final_cost(problem, end)[1]
+        missed = np.abs(slope) * sizes > MOST_OF * abs(best.cost)
         for i, number in goals_of(problem.constraints, problem.dynamics).items():
             missed[i] |= abs(end[i] - number) > self._runs.allowed
         space, places = problem.control_coordinates, np.flatnonzero(missed)
