@@ -1,9 +1,8 @@
 """The result of a solve: a plan with its feedback law, and how it was found. NumPy only."""
 
-import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -181,24 +180,24 @@ class Solution(Plan):
     scenario: Annotated[str, 10 * LINE] = ""
     candidates: tuple[Candidate, ...] = ()
     problem_parts: Mapping[str, Annotated[str, 10 * LINE]] = field(default_factory=dict)
+    _later: ClassVar[Mapping[str, Callable[[], Any]]] = {}  # makes parts, by name, when they are first read
 
     @classmethod
     def _assembled(cls, later: Mapping[str, Callable[[], Any]], **parts: Any) -> "Solution":
-        """A solution without checks, for solvers, whose parts fit; `later` makes parts when they are first read."""
+        """A solution without checks, for solvers, whose parts fit; `later` makes further parts."""
         solution = object.__new__(cls)
         vars(solution).update(parts, _later=later)
         return solution
 
     def _examined_by(self, examine: Callable[[], BetweenKnots]) -> "Solution":
         """This solution, which from now on can say what its plan does between its knots."""
-        vars(self)["_examine_between_knots"] = functools.cache(examine)
+        vars(self)["_later"] = {**self._later, "_examined": examine}
         return self
 
     def __getattr__(self, name: str) -> Any:
-        later = vars(self).get("_later", {})
-        if name not in later:
+        if name not in self._later:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        return vars(self).setdefault(name, later[name]())  # two threads that read it get the same object
+        return vars(self).setdefault(name, self._later[name]())  # two threads that read it get the same object
 
     def __getstate__(self) -> dict[str, Any]:
         """The attributes, with all parts made."""
@@ -240,11 +239,11 @@ class Solution(Plan):
         Raises:
           InputError: the solution is from a file or was changed since `smooth` returned it, or is not finite.
         """
-        examine = vars(self).get("_examine_between_knots")
-        if examine is None or not self.trajectory.finite:
-            got = "a solution from a file, or one that was changed" if examine is None else "a plan that is not finite"
+        known = "_examined" in self._later
+        if not (known and self.trajectory.finite):
+            got = "a plan that is not finite" if known else "a solution from a file, or one that was changed"
             raise InputError(f"between_knots: got {got}, want one as smooth returns it, as smooth(problem, start=this)")
-        return examine()
+        return self._examined
 
     @property
     def dynamics_residual(self) -> float:
@@ -330,7 +329,7 @@ class Solution(Plan):
 
     def _between_knots(self) -> list[str]:
         """What is wrong between the knots, with the remedy; nothing for a plan that failed, or from a file."""
-        if not self.success or "_examine_between_knots" not in vars(self):
+        if not self.success or "_examined" not in self._later:
             return []
         faults = self.between_knots()._faults(1e-6)  # the default tolerance
         remedies = {"accuracy": "accuracy=1e-6", "between_knots": "between_knots=True"}

@@ -1,10 +1,11 @@
 """From one start to the end: the methods that finish a run, and the order in which they are tried.
 
-`finish` without constraints: smoothing and Newton's method; the interior point if controls stay at their limits, or all
-else fails. With constraints, the interior point begins from one plan after another (`ConstrainedRun`). If none of them
-leads to an optimum, the plan that violates the constraints least is the answer. It is INFEASIBLE if two starts lead to
-plans whose violation is stationary and equally large. With the augmented Lagrangian (`augmented_lagrangian.py`), the
-evidence is a violation that does not fall while the penalty grows.
+`finish` certifies each result. Without constraints, that is what `SolveRun.run_to_end` leads to by smoothing and
+Newton's method; the interior point comes before if controls stay at their limits, and after if all else fails. With
+constraints, the interior point begins from one plan after another (`ConstrainedRun`). If none of them leads to an
+optimum, the plan that violates the constraints least is the answer. It is INFEASIBLE if two starts lead to plans whose
+violation is stationary and equally large. With the augmented Lagrangian (`augmented_lagrangian.py`), the evidence is a
+violation that does not fall while the penalty grows.
 
 A plan of the interior point that converges is a minimum of the augmented Lagrangian with the multipliers found.
 Newton's method on that function finishes the plan. This puts controls exactly at their limits, and gives a policy and

@@ -69,13 +69,13 @@ class Runs:
     """The runs of a search: how they begin and end, which are named among the candidates, and the results so far.
 
     Attributes:
-      allowed: the largest violation of a constraint. known: what the runs know of one another.
+      method: how the problem is solved. known: what the runs know of one another.
       finished: the runs that ended, with their results, the best first.
     """
 
     def __init__(self, problem: Problem, settings: SmootherSettings, stop: Stop) -> None:
         self.problem, self.settings, self.stop = problem, settings, stop
-        self.allowed, self.known = settings.method(problem).violation, Known()
+        self.method, self.known = settings.method(problem), Known()
         self.named: list[tuple[str, SolveRun]] = []
         self.finished: list[tuple[SolveRun, RunResult]] = []
 
@@ -119,7 +119,7 @@ class Runs:
 
     def cheaper_elsewhere(self, less: float) -> int | None:
         """Number of the cheapest plan that keeps the constraints, if it costs less than the best by this share."""
-        allowed, best = self.allowed, self.best.cost
+        allowed, best = self.method.violation, self.best.cost
         kept = [result.violation <= allowed and np.isfinite(result.cost) for _, result in self.finished]
         costs = np.where(kept, [result.cost for _, result in self.finished], np.inf)
         return int(np.argmin(costs)) if costs.min() < best - less * abs(best) else None
@@ -134,7 +134,6 @@ class Search:
     ) -> None:  # fmt: skip
         """By default from the caller's start, or the usual ones."""
         self._problem, self._settings, self._stop, self.runs = problem, settings, stop, Runs(problem, settings, stop)
-        self._exact = settings.method(problem).exact
         self._guided = multistart.path_weight(problem) > 0  # whether obstacles in the cost push the plan
         self._default = settings.start is None and settings.starts is None  # not by the caller's choice
         self.tried = not settings.safeguard  # whether other starts were tried, as far as they are to be
@@ -159,7 +158,7 @@ class Search:
         given = _initial_rollout(begun[0]) if is_plan else None
         with self._stop.reporting("smooth"):
             with self._problem.dynamics.solving(self._solving):
-                self.finish_promising()
+                self.solve_from_starts()
                 answered = given is None and self.is_answered
                 if not answered:
                     self.try_other_starts()
@@ -171,7 +170,7 @@ class Search:
                 self.try_other_dynamics(given)
         run, result = self.runs.finished[0]
         result = result if answered else self._judged(result)
-        tolerances = {"tolerance": run.method.tolerance, "constraint_tolerance": self.runs.allowed}
+        tolerances = {"tolerance": run.method.tolerance, "constraint_tolerance": self.runs.method.violation}
         options = self._settings.options(run.initial_guess if self._settings.start is None else guess) | tolerances
         solution = assemble(run, result, solver="smooth", options=options, candidates=self._candidates())
         for run in begun:
@@ -188,11 +187,11 @@ class Search:
         poor = self._default and self._is_unacceptable
         return not (at_saddle or poor or self._detours() or self._approaches.unmoved())
 
-    def finish_promising(self) -> None:
+    def solve_from_starts(self) -> None:
         """Finish the most promising run; with constraints, also the others, as long as they may cost less."""
         problem = self._problem
         chosen, *others = choose([run for _, run in self.runs.named], self._stop.threads)
-        if not (problem.constraints or self._exact):  # for which other methods follow smoothing
+        if not (problem.constraints or self.runs.method.exact):  # for which other methods follow smoothing
             chosen = self.smooth_or_follow_a_line(chosen)
         self.runs.offer(chosen, self.runs.result_of(chosen))
         if not problem.constraints:
@@ -268,7 +267,7 @@ class Search:
             self.runs.try_from(f"the constant controls {', '.join(f'{u:.3g}' for u in control)}", control)
             if self.runs.best.success or self._stop.due:
                 return
-        if self._exact and not np.isfinite(self.runs.best.cost):
+        if self.runs.method.exact and not np.isfinite(self.runs.best.cost):
             self.runs.try_from("a line of states", line_of_states(problem), from_states)
 
     def try_reweighted(self) -> None:
@@ -296,10 +295,10 @@ class Search:
 
     def try_elsewhere(self) -> None:
         """Try other starts until one leads to a plan, before the constraints are called infeasible."""
-        problem = self._problem
-        if self._exact:
+        problem, exact = self._problem, self.runs.method.exact
+        if exact:
             self._follow_ways()
-        motions = dict[str, StartLike](self._motions()) if self._exact and not self.runs.best.success else {}
+        motions = dict[str, StartLike](self._motions()) if exact and not self.runs.best.success else {}
         sways = {sinusoidal_name(cycles): sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2]}
         for name, start in (motions | sways).items():
             if self._stop.due or self.runs.best.success:
@@ -307,7 +306,7 @@ class Search:
             self.runs.known.from_start = False
             # A trajectory is on one side of the obstacles; smoothing without the constraints would leave this side. The
             # augmented Lagrangian method stays there only if it begins with the start's own plan.
-            self.runs.try_from(name, start, finish if self._exact and name in sways else refine)
+            self.runs.try_from(name, start, finish if exact and name in sways else refine)
         self.tried = not self._stop.due
 
     def _follow_ways(self) -> None:
@@ -322,7 +321,7 @@ class Search:
     @property
     def is_barred(self) -> bool:
         """Whether no plan keeps the constraints, some of which may be passed on one side or another."""
-        return self.is_poor and self._exact and not self.runs.best.success and any(passable(self._problem))
+        return self.is_poor and self.runs.method.exact and not self.runs.best.success and any(passable(self._problem))
 
     def try_past_constraints(self) -> None:
         """Plan without the constraints that may be passed on one side or another.
@@ -388,7 +387,7 @@ class Search:
     def _detours(self) -> dict[str, Trajectory]:
         """New paths on other sides of constraints that the best plan touches, by name, unless a cost chose its side."""
         touched = itertools.compress(self.runs.best.multipliers, passable(self._problem))
-        chosen = self._settings.start is not None or not self._exact or self._guided
+        chosen = self._settings.start is not None or not self.runs.method.exact or self._guided
         if chosen or not any(multipliers.values.any() for multipliers in touched):
             return {}
         tried = {name for name, _ in self.runs.named}
@@ -644,7 +643,7 @@ class Approaches:
             slope = _final_cost(problem, end)[1]
         missed = np.abs(slope) * sizes > MOST_OF * abs(best.cost)
         for i, number in goals_of(problem.constraints, problem.dynamics).items():
-            missed[i] |= abs(end[i] - number) > self._runs.allowed
+            missed[i] |= abs(end[i] - number) > self._runs.method.violation
         space, places = problem.control_coordinates, np.flatnonzero(missed)
         span = np.subtract(space.high, space.low)
         span = np.where(np.isfinite(span), span, np.maximum(np.abs(controls).max(axis=0), 1.0))
@@ -845,7 +844,7 @@ def _searched(problem: Problem, runs: Runs) -> tuple[SolveRun, RunResult]:
     """The best run of a search for another problem than that of these runs, as far as the choice of a start."""
     search = Search(problem, runs.settings, runs.stop, guides(problem, None))
     with problem.dynamics.solving(search._solving):
-        search.finish_promising()
+        search.solve_from_starts()
         search.try_other_starts()
     return search.runs.finished[0]
 
