@@ -491,7 +491,10 @@ class SolveRun:
         model: records.ProblemModel | None = None,
     ) -> None:  # fmt: skip
         """Check a plan and its policy with a cost-to-go, by `kernels/certificate.py`; by default of the run's model."""
-        call = self._check_arguments(task, result, to_go, certificate)
+        call = self._stated(
+            task, 0, 0, self._rows, self.method.tolerance, {}, to_go=to_go, last=result.plan, last_policy=result.policy,
+            certificate=certificate,
+        )  # fmt: skip
         self._loop(*call._replace(model=model or call.model))
 
     def _iterate(
@@ -572,13 +575,6 @@ class SolveRun:
         call = self._plan_arguments(declarations.LINEARIZE, DAMPED_STEPS, self.method.rough, 0.0, 0, 0, rows)
         *_, failed = self._loop(*call._replace(**changed))
         return float(rows["optimality"][0]), failed
-
-    def _check_arguments(self, task: int, result: RunResult, to_go: CostToGo, certificate: StructuredArray) -> LoopCall:
-        """Arguments for certifying a plan and its policy with this cost-to-go."""
-        return self._stated(
-            task, 0, 0, self._rows, self.method.tolerance, {}, to_go=to_go, last=result.plan, last_policy=result.policy,
-            certificate=certificate,
-        )  # fmt: skip
 
     def _stated(
         self, task: int, begin: int, end: int, rows: StructuredArray, tolerance: float, options: dict[str, Any],
