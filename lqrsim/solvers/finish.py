@@ -112,7 +112,7 @@ def from_states(run: SolveRun, known: Known) -> RunResult:
     return certified(run, point.initial_rollout() if result is None else result)
 
 
-def from_beside(run: SolveRun, plan: Trajectory, saddle: RunResult) -> RunResult | None:
+def from_beside(run: SolveRun, known: Known, plan: Trajectory, saddle: RunResult) -> RunResult | None:
     """The certified result from a plan beside a saddle, which costs less; None if it leads back there."""
     point = InteriorRun(run)
     if run.problem.constraints:

@@ -9,6 +9,8 @@ import contextlib
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -61,7 +63,8 @@ NEARER = 0.3  # part of the way to its goal that a body must be taken
 LEAST_WAY = 0.1  # least way of a joint, relative to the longest, by which its weight along an approach is scaled
 NONE = 1e-9  # change of a state, relative to its size, that counts as none
 
-Finish = Callable[[SolveRun, Known], RunResult]
+R = TypeVar("R")
+Finish = Callable[[SolveRun, Known], R]
 Start = StartLike | InitialGuess
 
 
@@ -95,9 +98,9 @@ class Runs:
         return run
 
     def result_of(
-        self, run: SolveRun, how: Finish = finish, *, most: int | None = None, known: Known | None = None
-    ) -> RunResult:
-        """Run to the end, or `most` iterations more. The callback is called for all iterations of the run so far, too.
+        self, run: SolveRun, how: Finish[R] = finish, *, most: int | None = None, known: Known | None = None
+    ) -> R:
+        """Run as `how` says, with at most `most` iterations more, and the callback for all iterations so far, too.
 
         What is known of the search's problem is not known of another.
         """
@@ -106,7 +109,7 @@ class Runs:
         with run.problem.dynamics.solving(self.stop.threads), run.budget.limited(most):
             return how(run, known)
 
-    def try_from(self, name: str, start: Start, how: Finish = finish) -> None:
+    def try_from(self, name: str, start: Start, how: Finish[RunResult] = finish) -> None:
         """Finish a run from another start, which is one of the candidates, and record its result."""
         run = self.add(start, name)
         self.offer(run, self.result_of(run, how))
@@ -155,7 +158,7 @@ class Search:
         begun = [run for _, run in self.runs.named]
         guess = begun[0].initial_guess
         is_plan = self._settings.start is not None and guess.prior is None and guess.interior is None
-        given = _initial_rollout(begun[0]) if is_plan else None
+        given = self.runs.result_of(begun[0], _initial_rollout) if is_plan else None
         with self._stop.reporting("smooth"):
             with self._problem.dynamics.solving(self._solving):
                 self.solve_from_starts()
@@ -209,19 +212,17 @@ class Search:
 
         From the controls that hold an arm, the first plans may swing it through itself or the floor, where plans stay.
         """
-        problem = self._problem
+        problem, most = self._problem, self._settings.max_iterations
         driven = 2 * len(problem.control_coordinates) >= len(problem.dynamics.state_coordinates)
         known = problem.start is not None and problem.goal is not None
         if not (driven and known and self._default and self._settings.safeguard):
             return run
-        run.budget.report()
-        run.smooth(self._settings.max_iterations)
+        self.runs.result_of(run, lambda run, _: run.smooth(most))
         unfinished = Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.RISK_TOO_HIGH
         if run.ending.success or run.ending.status in unfinished or self._stop.due:
             return run
         line = self.runs.add(line_of_states(problem), "a line of states")
-        line.budget.report()
-        line.smooth(self._settings.max_iterations)
+        self.runs.result_of(line, lambda line, _: line.smooth(most))
         return line if line.ending.success or line.work.cost < run.work.cost else run
 
     def try_other_starts(self) -> None:
@@ -280,8 +281,7 @@ class Search:
             runs = [self.runs.another(guide, heavier) for _, guide in guides(heavier, None)]
             try:
                 chosen = choose(runs, self._stop.threads)[0]
-                chosen.budget.report()
-                heaviest = chosen.run_to_end()
+                heaviest = self.runs.result_of(chosen, lambda run, _: run.run_to_end())
             except InputError:  # the heavier cost is not finite at the start
                 continue
             if stop.due:
@@ -425,8 +425,7 @@ class Search:
                 self._problem.dt,
             )  # fmt: skip
             run_beside = self.runs.another(guess_from(saddle, "a saddle"))
-            run_beside.budget.report()
-            result = from_beside(run_beside, beside, saddle)
+            result = self.runs.result_of(run_beside, partial(from_beside, plan=beside, saddle=saddle))
             if self._stop.due:
                 break
             if result is not None and result.success and result.cost < saddle.cost - SADDLE_DECREASE * abs(saddle.cost):
@@ -605,8 +604,7 @@ class Approaches:
         self._cheapest = next(((name, cost) for missed, cost, name, _ in plans if not missed), None)
         for _, _, name, begin in plans[:PUSHES]:
             run = self._runs.add(begin, name)
-            with problem.dynamics.solving(self._stop.threads):
-                begun, other = _initial_rollout(run), self._runs.result_of(run, refine)
+            begun, other = (self._runs.result_of(run, how) for how in (_initial_rollout, refine))
             if other.is_worse(begun, run.work):  # a plan that no step can begin from is left by smoothing
                 status = Status.TIME_LIMIT if self._stop.due else Status.STALLED
                 other = replace(begun, status=status, detail="no step lowers the cost of this plan")
@@ -819,11 +817,10 @@ class Softening:
         from lqrsim.solvers.contact_modes import keep_modes  # this imports MuJoCo, which few problems need
 
         run = self._runs.another(guess_from(plan, "the best plan"))
-        run.budget.report()
         result = None
         # A cost that is not curved in all controls has no descent of this kind.
-        with self._problem.dynamics.solving(self._stop.threads), contextlib.suppress(np.linalg.LinAlgError):
-            result = keep_modes(run, plan)
+        with contextlib.suppress(np.linalg.LinAlgError):
+            result = self._runs.result_of(run, lambda run, _: keep_modes(run, plan))
         if result is None:
             return False
         self._runs.named.append(("the best plan, within its contact modes", run))
@@ -849,7 +846,7 @@ def _searched(problem: Problem, runs: Runs) -> tuple[SolveRun, RunResult]:
     return search.runs.finished[0]
 
 
-def _initial_rollout(run: SolveRun) -> RunResult:
+def _initial_rollout(run: SolveRun, _: Known) -> RunResult:
     """The rollout of the initial policy, certified, as a plan that the answer must not be worse than."""
     run.roll_out()
     work, policy = run.work, run.work.arrays.last_policy
