@@ -194,8 +194,8 @@ class SolveRun:
         self.problem, self.settings, self.initial_guess, self.budget = problem, settings, initial_guess, budget
         kind = entry, compiled.core(problem, settings.form), problem.steps
         self.work = _pool.take(lambda idle: idle.kind == kind) or Workspace(problem, settings.form, entry)
-        self.work.begin(problem, settings, initial_guess, start, budget.stop)
-        self.method = self.work.method
+        self.work.begin(problem, settings, initial_guess, start)
+        self.method, self.work.stop = self.work.method, budget.stop
         self._stages: Stages | None = None
         self._rows, self._row = np.zeros(max(budget.left, 1), LOG), 0  # rows of smoothing, and the next row
         self._last: Iteration | None = None  # the last iteration of smoothing
@@ -208,6 +208,7 @@ class SolveRun:
     def give_back(self) -> None:
         """Let later runs have the memory."""
         self.release_stages()
+        self.work.stop = Stop()  # the solve's has its callback and exception, which later runs need not keep
         _pool.give_back(self.work, self.problem)
 
     @property
@@ -599,11 +600,11 @@ class Workspace:
       multipliers: multipliers of each constraint; changes act at once.
       start: (n,) the start state. best: the best plan so far. last: the last rollout of smoothing. trial: the rollout
         that a line search from the best plan tries. core: the compiled iterations. kind: what its runs have in common.
-      fixed: whether the start is given exactly. method: as in `SolveRun`.
+      fixed: whether the start is given exactly. method: as in `SolveRun`. stop: that of the run's budget.
     """
 
     def __init__(self, problem: Problem, form: str, entry: str) -> None:
-        self._dual, self._calls = form == "dual", dict[str, Call]()
+        self._dual, self._calls, self.stop = form == "dual", dict[str, Call](), Stop()
         self.core, self._costs = compiled.core(problem, form), compiled.costs_module(problem)
         self.kind = entry, self.core, problem.steps
         self.memory_rows = np.zeros(1, records.MEMORY)
@@ -619,15 +620,13 @@ class Workspace:
     def compiled_call(self, module: CompiledModule, name: str, *arguments: Any) -> Call:
         """The call of a function, which is compiled if it is new; its arguments are laid out once."""
         if name not in self._calls:
-            with self._stop.not_counting():  # compiling
+            with self.stop.not_counting():  # compiling
                 self._calls[name] = module.lay_out(name, *arguments)
         return self._calls[name]
 
-    def begin(
-        self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array, stop: Stop
-    ) -> None:
+    def begin(self, problem: Problem, settings: SmootherSettings, initial_guess: InitialGuess, start: Array) -> None:
         """Begin a solve. The memory may have served another solve of the same size and number of steps."""
-        self._problem, self._stop, steps = problem, stop, problem.steps
+        self._problem, steps = problem, problem.steps
         self.method = method = settings.method(problem)
         self.priced, self.fixed = np.isfinite(method.price), isinstance(problem.initial, FixedState)
         self.prior, self.prior_iterations = self.no_prior, 0

@@ -240,9 +240,8 @@ class InteriorRun:
 
     def initial_rollout(self) -> RunResult:
         """The rollout of the initial policy."""
-        guess, start = self._run.initial_guess, self._run.work.start
-        policy = Policy(guess.gain, guess.offset)
-        return self.result(self._run.work.roll_out(policy, start), policy)
+        policy = Policy(self._run.initial_guess.gain, self._run.initial_guess.offset)
+        return self.result(self._run.work.roll_out(policy, self._run.work.start), policy)
 
     def result(self, plan: Motion, policy: Policy | None = None) -> RunResult:
         """The result for a plan that has not converged; without a policy, its controls are applied without feedback."""

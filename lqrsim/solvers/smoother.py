@@ -300,8 +300,7 @@ def _check_ilqr(problem: Problem, settings: Settings) -> None:
         )
 
 
-def _solve_ilqr(problem: Problem, settings: Settings, stop: Stop | None = None) -> Solution:
-    stop = Stop() if stop is None else stop
+def _solve_ilqr(problem: Problem, settings: Settings, stop: Stop) -> Solution:
     stop.begin(settings.time_limit)
     solve_part: Callable[..., Solution] = partial(_iterate_ilqr, stop=stop)
     if problem.control_rate is not None:
@@ -343,9 +342,8 @@ def _iterate_ilqr(problem: Problem, settings: Settings, stop: Stop) -> Solution:
     return solution
 
 
-def solve(problem: Problem, settings: SmootherSettings, stop: Stop | None = None) -> Solution:
+def solve(problem: Problem, settings: SmootherSettings, stop: Stop) -> Solution:
     """Solve one problem; the solution can look at its plan between the knots."""
-    stop = Stop() if stop is None else stop
     stop.begin(settings.time_limit)
 
     def search(problem: Problem, settings: SmootherSettings, *, trees: bool = True) -> Solution:
@@ -457,7 +455,7 @@ def _solve_all(
     threads: int | None,
     progress: Progress | None,
 ) -> list[Solution]:
-    """Solve each problem with `solve(problem, settings)`, on several threads; return the solutions in order."""
+    """Solve each problem with `solve(problem, settings, stop)`, on several threads; return the solutions in order."""
     threads = check_threads(threads)
     for i, problem in enumerate(problems):
         try:
@@ -469,7 +467,7 @@ def _solve_all(
             raise InputError(f"problems[{i}]: {error}") from None
     functions = [function for problem in problems for function in functions_of(problem)]
     with workers(threads, functions) as pool:
-        futures = [pool.submit(solve, problem, settings) for problem in problems]
+        futures = [pool.submit(solve, problem, settings, Stop()) for problem in problems]
         done = 0
         report = reported("solving", lambda: f"{done} of {len(futures)} problems done")
         with report if progress is None else contextlib.nullcontext():
