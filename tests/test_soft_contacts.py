@@ -252,7 +252,7 @@ def test_a_failed_plan_among_contacts_says_that_time_was_over(monkeypatch: pytes
 
     monkeypatch.setattr(budget, "time", SimpleNamespace(perf_counter=read))
     problem, options = hop(robot_of("leg", 1.0)), SmootherSettings(max_iterations=12)
-    real = strategy.Search.finish_promising
+    real = strategy.Search.solve_from_starts
 
     def run(search: strategy.Search) -> None:
         """As if no step had lowered the cost of the first plan any more."""
@@ -260,7 +260,7 @@ def test_a_failed_plan_among_contacts_says_that_time_was_over(monkeypatch: pytes
         first, found = search.runs.finished[0]
         search.runs.finished[0] = first, replace(found, status=ls.Status.STALLED, detail="no step lowers the cost")
 
-    monkeypatch.setattr(strategy.Search, "finish_promising", run)
+    monkeypatch.setattr(strategy.Search, "solve_from_starts", run)
     solution = smoother.solve(problem, replace(options, time_limit=limit))
     assert solution.status is ls.Status.TIME_LIMIT
     assert np.isfinite(solution.cost)
