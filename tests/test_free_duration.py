@@ -263,9 +263,9 @@ def test_the_time_limit_is_that_of_the_whole_solve(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(budget, "time", SimpleNamespace(perf_counter=read))
     short, options = dataclasses.replace(problem(), dt=1 / 20), SmootherSettings()
-    assert smoother.solve(short, options).success
+    assert smoother.solve(short, options, budget.Stop()).success
     whole, now[0] = now[0], 0.0
-    limited = smoother.solve(short, dataclasses.replace(options, time_limit=share * whole))
+    limited = smoother.solve(short, dataclasses.replace(options, time_limit=share * whole), budget.Stop())
     assert limited.status is Status.TIME_LIMIT or (limited.success and share > 0.01)
     assert now[0] <= share * whole + 40
     assert whole > 300

@@ -261,7 +261,7 @@ def test_a_failed_plan_among_contacts_says_that_time_was_over(monkeypatch: pytes
         search.runs.finished[0] = first, replace(found, status=ls.Status.STALLED, detail="no step lowers the cost")
 
     monkeypatch.setattr(strategy.Search, "solve_from_starts", run)
-    solution = smoother.solve(problem, replace(options, time_limit=limit))
+    solution = smoother.solve(problem, replace(options, time_limit=limit), budget.Stop())
     assert solution.status is ls.Status.TIME_LIMIT
     assert np.isfinite(solution.cost)
     assert solution.remedy.startswith("raise time_limit")
