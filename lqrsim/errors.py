@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from lqrsim.machine import memory, outdated
 
-if outdated():
+if outdated():  # here, because every module imports this one
     raise ImportError(f"lqrsim: {outdated()}")
 
 Array = npt.NDArray[np.floating]
@@ -125,7 +125,7 @@ def shaped(field: str, value: npt.ArrayLike, shape: tuple[int | None, ...]) -> A
     return array
 
 
-def check_weights(field: str, value: npt.ArrayLike, size: int) -> Array:
+def check_weight_vector(field: str, value: npt.ArrayLike, size: int) -> Array:
     """Weights (size,), from one number for all or an array. Raises InputError unless they are finite and >= 0."""
     try:
         single = np.ndim(value) == 0  # pyright: ignore[reportArgumentType]
@@ -284,14 +284,14 @@ def check_items(
     return items
 
 
-def check_weight(field: str, value: npt.ArrayLike, *, definite: bool = False) -> Array:
+def check_weight_matrix(field: str, value: npt.ArrayLike, *, definite: bool = False) -> Array:
     """`value` as a symmetric positive-semidefinite (or definite) matrix; a vector is read as its diagonal.
 
     Three axes are matrices (K, n, n), one for each knot.
     """
     raw = numbers_of(field, value, "a matrix of numbers or its diagonal")
     if raw.ndim == 3 and len(raw):
-        weights = np.array([check_weight(f"{field}: row {k}", row, definite=definite) for k, row in enumerate(raw)])
+        weights = np.array([check_weight_matrix(f"{field}: row {k}", w, definite=definite) for k, w in enumerate(raw)])
         weights.setflags(write=False)
         return weights
     if raw.ndim == 1:
@@ -361,7 +361,7 @@ def renamed(old: str, new: str) -> Callable[..., Any]:
     """The earlier name of a method, which warns, for programs of the version before."""
 
     def method(self: Any, *arguments: Any, **options: Any) -> Any:
-        warnings.warn(f"{old} is {new} now; the earlier name goes in lqrsim 0.4", FutureWarning, stacklevel=2)
+        warnings.warn(f"{old} is {new} now; the old name will be removed in lqrsim 0.4", FutureWarning, stacklevel=2)
         return getattr(self, new)(*arguments, **options)
 
     method.__doc__ = f"The earlier name of `{new}`."
@@ -423,9 +423,9 @@ def brief(value: object, depth: int = 0) -> str:
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{name}: {brief(entry, depth + 1)}" for name, entry in value.items()) + "}"
     if isinstance(value, (list, tuple)):
-        listed = [brief(item, depth + 1) for item in value]
-        same = len(listed) > 3 and len(set(listed)) == 1
-        text = f"{listed[0]}, ... {len(listed)} times" if same else ", ".join(listed)
+        entries = [brief(item, depth + 1) for item in value]
+        same = len(entries) > 3 and len(set(entries)) == 1
+        text = f"{entries[0]}, ... {len(entries)} times" if same else ", ".join(entries)
         return f"[{text}]" if isinstance(value, list) else f"({text})"
     return getattr(value, "__qualname__", None) or without_addresses(repr(value))
 

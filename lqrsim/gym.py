@@ -52,6 +52,7 @@ from lqrsim.errors import (
 from lqrsim.results.coordinates import Spaces, check_same_system, spaces_of
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
+from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import disturbance_set, resolve
 from lqrsim.scenarios.solutions import check_solution, remarks, solve
@@ -76,7 +77,7 @@ RESET_OPTIONS = ("disturbances", "preset", "strength", "trial")
 
 
 class Task:
-    """The task of an environment. It takes the arguments of `Environment`."""
+    """What an environment runs: scenario, plant, solution, disturbances, and how actions become controls."""
 
     def __init__(
         self, scenario: str | Scenario, solution: Solution | str | os.PathLike[str] | None, disturbances: Disturbances,
@@ -219,17 +220,14 @@ class Resettable:
 
     def _begin(self, seed: int | None, random: np.random.Generator, options: Any) -> "Episode":
         """Begin an episode: the first trials of a seed, or those after the last episode."""
-        if seed is not None:
-            self._seed, self._next_trial = seed, 0
-        elif self._seed is None:
-            self._seed = int(random.integers(2**63))
-        assert self._seed is not None
-        first, disturbances = self.task.choices_of(options, self._next_trial)
+        first, disturbances = self.task.choices_of(options, self._next_trial if seed is None else 0)
+        if seed is None:
+            seed = int(random.integers(2**63)) if self._seed is None else self._seed
         self._episode = Episode(
-            self.task, self._trials, disturbances=disturbances, seed=self._seed, first_trial=first,
+            self.task, self._trials, disturbances=disturbances, seed=seed, first_trial=first,
             frames=self._frames, threads=self._threads,
         )  # fmt: skip
-        self._next_trial = first + self._trials
+        self._seed, self._next_trial = seed, first + self._trials  # which a refused reset leaves as they were
         return self._episode
 
     def _current(self) -> "Episode":
@@ -375,8 +373,8 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
     @checked
     def reset(self, *, seed: Seed | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Begin an episode; see the class."""
-        super().reset(seed=seed)
         before, episode = self._episode, self._begin(seed, self.np_random, options)
+        super().reset(seed=seed)
         if before is not None and not np.array_equal(before.loop.effects.displaced, episode.loop.effects.displaced):
             self._picture.close()  # its obstacles are where they were in the episode before
         return episode.observations[0], self._info(episode)
@@ -496,8 +494,8 @@ class VectorEnvironment(Resettable, VectorEnv[Array, Array, Any]):
         mask = options.pop("reset_mask", None)
         if mask is not None and not check_array("options: reset_mask", mask, (self.num_envs,)).all():
             raise InputError("options: reset_mask: got a part of the episodes, want all: they begin together")
-        super().reset(seed=seed)
         episode = self._begin(seed, self.np_random, options)
+        super().reset(seed=seed)
         return episode.observations, self._info(episode)
 
     def step(self, actions: npt.ArrayLike) -> tuple[Array, Array, Flags, Flags, dict[str, Any]]:
@@ -544,7 +542,7 @@ for _name, _scenario in {**SCENARIOS, ANY_SCENARIO: None}.items():
         )  # fmt: skip
 
 
-NAMED = "NAMESPACE/NAME-vVERSION, such as quadrotor/light-v0, of letters, digits, - and _"
+NAME_FORM = "NAMESPACE/NAME-vVERSION, such as quadrotor/light-v0, of letters, digits, - and _"
 FACTS = ("robot", "scene", "disturbances", "seed", "policy_digest")  # of each rollout, in the data set's metadata
 
 
@@ -575,9 +573,9 @@ def write_minari(name: str, env: Any, rollouts: Rollout | Iterable[Rollout], **a
     except ImportError as error:
         raise InputError(f"minari: {error}; run: pip install 'lqrsim[minari]'") from None
     try:
-        parse_dataset_id(check_text("name", name, NAMED))
+        parse_dataset_id(check_text("name", name, NAME_FORM))
     except (ValueError, TypeError):  # a TypeError for a name without a version
-        raise InputError(f"name: got {excerpt(name)}, want {NAMED}") from None
+        raise InputError(f"name: got {excerpt(name)}, want {NAME_FORM}") from None
     unwrapped = check_kind("env", getattr(env, "unwrapped", env), Environment, "an Environment of lqrsim.gym")
     task, facts, episodes = unwrapped.task, list[Any](), list[Any]()
     runs = [rollouts] if isinstance(rollouts, Rollout) else rollouts
@@ -596,7 +594,7 @@ def write_minari(name: str, env: Any, rollouts: Rollout | Iterable[Rollout], **a
     about = {"description": f"{task.scenario.name}: {task.scenario.summary}", "env": unwrapped, **about}
     try:
         with _removed_on_failure(get_dataset_path(name)), warnings.catch_warnings():
-            warnings.filterwarnings("ignore", module=r"minari\.")  # what is not known, such as an author
+            warnings.filterwarnings("ignore", module=r"minari\.")  # of metadata that are missing, such as the author
             storage = minari.create_dataset_from_buffers(name, cast("list[Any]", buffers()), **about).storage
             storage.update_episode_metadata(episodes)
             storage.update_metadata({"lqrsim": facts})
@@ -622,6 +620,11 @@ def _removed_on_failure(folder: Path) -> Iterator[None]:
         raise
 
 
+def same_plan(first: Trajectory, second: Trajectory) -> bool:
+    pairs = (first.states, second.states), (first.controls, second.controls)
+    return first.dt == second.dt and all(np.array_equal(*pair) for pair in pairs)
+
+
 def _runs_of(task: Task, rollouts: Iterable[Any]) -> Iterator[Rollout]:
     """The runs. Raises InputError unless each is a run of the task's plan."""
     wanted = "a Rollout, or several, such as simulate(...) returns"
@@ -631,9 +634,7 @@ def _runs_of(task: Task, rollouts: Iterable[Any]) -> Iterator[Rollout]:
     for rollout in rollouts:
         run_plan = check_kind("rollouts", rollout, Rollout, wanted).plan
         check_same_system("rollouts", "a run", spaces_of(rollout), system, "the environment")
-        if run_plan.dt != plan.dt or not all(
-            map(np.array_equal, (run_plan.states, run_plan.controls), (plan.states, plan.controls))
-        ):
+        if not same_plan(run_plan, plan):
             raise InputError("rollouts: got runs of another plan than env's, want env to have their solution=")
         yield rollout
 

@@ -175,7 +175,7 @@ def _text_and_tables(
     warnings = [] if done == all_trials else [f"Not finished: {done} of {all_trials} trials have been run."]
     if erred:
         warnings.append(f"{erred} trials ended with an error; they count as failures.")
-    warnings += [f"{line}." for line in results.came_to_nothing()]
+    warnings += [f"{line}." for line in results.stop_reasons()]
     first = campaign.policies[0]
     target, radius = results.solution(first).target, results.goal_radius(first)
     return {

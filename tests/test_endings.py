@@ -838,7 +838,7 @@ def test_a_campaign_says_whose_filter_diverged(tmp_path: Path, monkeypatch: pyte
     reasons = results.reasons(cell)
     assert sorted(reasons) == diverged.tolist()
     assert all(re.fullmatch(r"filter at .* s: the estimate of \w+ is .*", reason) for reason in reasons.values())
-    said = results.came_to_nothing()
+    said = results.stop_reasons()
     assert len(said) == min(len(set(reasons.values())), 5)
     assert all(re.fullmatch(r"[1-9]\d* trials were stopped: filter at .*", line) for line in said)
     assert all(line in results.summary().splitlines() for line in said)

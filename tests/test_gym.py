@@ -204,6 +204,31 @@ def test_options_of_reset(quadrotor: ls.Scenario, quadrotor_solution: ls.Solutio
     np.testing.assert_array_equal(again, calm)
 
 
+REFUSED: tuple[Any, ...] = (
+    {"wind": 1}, {"preset": "mild"}, {"strength": 2}, {"trial": -1}, {"disturbances": "light", "strength": -1},
+    {"preset": "calm", "disturbances": ()}, {"disturbances": (ls.disturbances.Push((1, 0, 0), at=99),)},
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("case", range(4))
+def test_a_refused_reset_changes_nothing(case: int, quadrotor_solution: ls.Solution) -> None:
+    """Each seed and trial is that of an environment whose resets were all right."""
+    rng, make = np.random.default_rng([91, case]), lqrsim.gym.make_vec if case % 2 else lqrsim.gym.make_env
+    options: dict[str, Any] = {"num_envs": 2} if case % 2 else {}
+    asked, other = (make("quadrotor", solution=quadrotor_solution, **options).unwrapped for _ in range(2))
+    for turn in range(6):
+        random = asked.np_random
+        with pytest.raises(InputError):
+            asked.reset(seed=rng.choice([None, int(rng.integers(9))]), options=rng.choice(REFUSED))
+        assert asked.np_random is random
+        seed = int(rng.integers(9)) if turn in (0, 3) else None
+        (_, found), (_, wanted) = asked.reset(seed=seed), other.reset(seed=seed)
+        assert (found["seed"], np.ravel(found["trial"]).tolist()) == (
+            wanted["seed"],
+            np.ravel(wanted["trial"]).tolist(),
+        )
+
+
 class Reading(Feedback):
     """The numbers that it wants are no observations, however many there are."""
 

@@ -1,12 +1,14 @@
 """Data sets of Minari: the episodes of the environment, to the last bit, as Minari and as h5py read them."""
 
 import dataclasses
+import itertools
 import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import mechanisms
 import numpy as np
 import pytest
 
@@ -206,3 +208,23 @@ def test_runs_and_campaigns_on_the_command_line(
     ):
         assert main(["export", str(tmp_path / "rollout.npz"), *words]) == 2
         assert line in capsys.readouterr().err
+
+
+def test_cells_are_of_one_plan(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All choices of cells of three policies, of which two have the same plan."""
+    monkeypatch.chdir(tmp_path)
+    Path("cart.xml").write_text(mechanisms.draw("cart", 0).xml, encoding="utf-8")
+    noise, policies = (ls.disturbances.ControlNoise(0.01),), ("smooth", "open_loop", "ilqr")
+    asked: Any = {"sweeps": {"noise": noise}, "strengths": (1.0,), "policies": policies, "trials": 2}
+    campaign = ls.stress.Campaign(scenario="cart.xml,steps=20,goal={'slider': 0.1}", **asked)
+    ls.stress.run_campaign(campaign, "campaign", workers=0)
+    for number, chosen in enumerate(c for size in range(4) for c in itertools.combinations(policies, size)):
+        plans = {"ilqr" if policy == "ilqr" else "smooth" for policy in chosen or policies}
+        cells = [f"{policy},noise,1" for policy in chosen]
+        words = ["export", "campaign", "--minari", f"run/n{number}-v0", *(["--cell", *cells] if cells else [])]
+        assert main(words) == (0 if len(plans) == 1 else 2)
+        said = capsys.readouterr()
+        assert said.err.startswith("lqrsim: error: --cell: got cells of ") == (len(plans) == 2)
+        assert (f"\n{2 * len(chosen)} episodes" in said.out) == (len(plans) == 1)

@@ -430,7 +430,7 @@ def test_errors_of_a_sensor_are_stated_once(names):
         with pytest.raises(InputError, match=r"SensorErrors: sensors: got .*, want each at most once"):
             SensorErrors(stated)
     else:
-        assert [one.noise for one in SensorErrors(stated).known] == [one.noise for one in stated]
+        assert [one.noise for one in SensorErrors(stated).sensor_records] == [one.noise for one in stated]
 
 
 def test_what_cannot_be_read_is_refused_by_name(on_track, cage, law, plan, problem):

@@ -12,7 +12,7 @@ from sampling import rarely
 from scipy import optimize, stats
 
 import lqrsim as ls
-from lqrsim.stress.statistics import compare, holm, independent_difference, mean, paired_difference, rate
+from lqrsim.stress.statistics import compare, holm, independent_difference, mean, paired_difference, rate, rounded
 
 
 def at_least(successes: int, trials: int, p: float) -> float:
@@ -221,3 +221,10 @@ def test_bootstrap_covers() -> None:
     found = [bootstrap(lambda x, axis: np.median(x, axis), draw, resamples=500) for draw in draws]
     covered = sum(one.low <= np.log(2) <= one.high for one in found)
     assert covered >= 200 * 0.95 - 3 * np.sqrt(200 * 0.95 * 0.05)
+
+
+@given(st.floats(1e-4, 1e12))
+def test_rounded_numbers_have_two_digits(number: float) -> None:
+    said = rounded(number)
+    assert float(said.replace(",", "")) == float(f"{number:.2g}")
+    assert ("e" in said) == (number >= 1e9)

@@ -23,6 +23,7 @@ from websockets.sync.client import connect
 
 import lqrsim as ls
 from lqrsim.cli import main
+from lqrsim.commands.viewing import View
 from lqrsim.errors import InputError
 from lqrsim.results import save_load
 from lqrsim.simulation.disturbances import ForceNoise
@@ -123,6 +124,42 @@ def test_what_can_not_be_shown(rollout: ls.Rollout, tmp_path: Path, capsys: pyte
     for arguments, reason in asked:
         assert main(["view", *arguments]) == 2
         assert reason in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("ending", [".npz", ".NPZ", ".Npz"])
+def test_a_run_is_known_by_its_ending(
+    ending: str, rollout: ls.Rollout, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = save_load.save(rollout, tmp_path / "run.npz").rename(tmp_path / f"run{ending}")
+    assert main(["view", str(path), "--trial", "1"]) == 2
+    assert capsys.readouterr().err.startswith("lqrsim: error: trial: got 1")
+
+
+FREE = """import dataclasses
+import lqrsim as ls
+
+def drive():
+    made = ls.scenarios.differential_drive()
+    return dataclasses.replace(made, problem=dataclasses.replace(made.problem, duration=(1.0, 60.0), time_weight=1.0))
+"""
+
+
+def test_the_rates_of_replanning_are_those_of_the_duration_found(
+    differential_drive: ls.Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """From one plan in it to one in each of its control periods, whatever was guessed of it."""
+    monkeypatch.chdir(tmp_path)
+    Path("free.py").write_text(FREE, encoding="utf-8")
+    assert main(["solve", "free.py:drive", "--out", "."]) == 0
+    plan = ls.load("solution.npz", ls.Solution).trajectory
+    assert abs(plan.dt - differential_drive.problem.dt) > 0.01 * plan.dt
+    monkeypatch.setattr(View, "_planning", lambda *_: sys.exit("planned"))
+    for rate, good in ((1 / plan.dt, 1), (1.01 / plan.dt, 0), (1 / plan.horizon, 1), (0.99 / plan.horizon, 0)):
+        capsys.readouterr()
+        with pytest.raises(SystemExit, match="planned") if good else contextlib.nullcontext():
+            assert main(["view", "free.py:drive", "--solution", "solution.npz", "--replan", repr(rate)]) == 2
+        assert ("--replan: got" in capsys.readouterr().err) == (not good)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="where windows are opened is said by DISPLAY")

@@ -159,7 +159,7 @@ def of_campaign(results: "ls.stress.Results") -> Object:
         "cells": cells,
         "left_out": results.manifest.left_out,
         "plans": results.plans(),
-        "came_to_nothing": results.came_to_nothing(),
+        "stop_reasons": results.stop_reasons(),
         "versions": results.manifest.versions,
     }
 

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 
 OVERLAY_HELP = "Drawn over the scene. " + " ".join(f"{name}: {kind.words}." for name, kind in OVERLAY_KINDS.items())
-OF_LIVE_RUNS = "controller", "design_disturbances", "solution", "replan", "disturbances", "seed", "push"
-OF_RECORDED_RUNS = "trial", "loop"
+LIVE_OPTIONS = "controller", "design_disturbances", "solution", "replan", "disturbances", "seed", "push"
+RECORDED_OPTIONS = "trial", "loop"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,20 +183,21 @@ class View:
         if self.seconds is not None:
             check_number("--seconds", self.seconds, above=0)
         options = {"push": self.push, "speed": self.speed, "seconds": self.seconds}
-        if self.what.endswith(".npz"):
-            refuse(self, OF_LIVE_RUNS, f"with {self.what}, want it with a SCENARIO")
+        if Path(self.what).suffix.lower() == ".npz":
+            refuse(self, LIVE_OPTIONS, f"with {self.what}, want it with a SCENARIO")
             rollout = ls.load(self.what, ls.Rollout)
             arguments = viewer.arguments_for_rollout(rollout, self.trial)
 
             def go(screen: "Viewer") -> None:
                 viewer.play(rollout, screen, trial=self.trial, loop=self.loop)
         else:
-            refuse(self, OF_RECORDED_RUNS, f"with {self.what}, want it with a RUN.npz")
+            refuse(self, RECORDED_OPTIONS, f"with {self.what}, want it with a RUN.npz")
             scenario = resolve(self.what)
             self._check_replanning(scenario.problem)
             given = self.solution
-            solution = console.solve_and_print(scenario) if given is None else self._given(scenario, given)
+            solution = self._load_solution(scenario, given) if given else console.solve_and_print(scenario)
             scenario = scenario.with_duration_of(solution)
+            self._check_replanning(scenario.problem)
             plant = scenario.plant()
             planner, goal = (None, None) if self.replan is None else self._planning(scenario.problem, solution)
             arguments = viewer.arguments_for_plant(plant, solution, goal)
@@ -216,7 +217,7 @@ class View:
         return 0
 
     @staticmethod
-    def _given(scenario: "ls.Scenario", path: Path) -> "ls.Solution":
+    def _load_solution(scenario: "ls.Scenario", path: Path) -> "ls.Solution":
         """Load the solution of a file. Raises InputError if it cannot run in the scenario."""
         from lqrsim.scenarios.solutions import check_solution, remarks
 
@@ -232,9 +233,10 @@ class View:
 
         if self.replan is None:
             return
-        # At least one plan per horizon, at most one per control period, with a tolerance for rounded rates.
-        slowest, fastest = 0.999 / (problem.steps * problem.dt), 1.001 / problem.dt
-        check_number("--replan", self.replan, at_least=slowest, at_most=fastest)
+        if problem.duration is None:  # a free one is known after the solve
+            # At least one plan per horizon, at most one per control period, with a tolerance for rounded rates.
+            slowest, fastest = 0.999 / (problem.steps * problem.dt), 1.001 / problem.dt
+            check_number("--replan", self.replan, at_least=slowest, at_most=fastest)
         if self.controller != "feedback":
             raise ls.InputError(f"--controller: got {self.controller} with --replan, want one of the two")
         if self.speed > 1:
@@ -304,7 +306,7 @@ class Verify:
         return 0 if verification.passed else 1
 
 
-OF_C, OF_MINARI = ("number", "gains", "interpolate", "name"), ("actions", "cell", "solution", "scenario")
+C_OPTIONS, MINARI_OPTIONS = ("number", "gains", "interpolate", "name"), ("actions", "cell", "solution", "scenario")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -335,9 +337,9 @@ class Export:
     actions: Literal["normalized", "controls"] = "normalized"
     """Of the data set: from -1 to 1 between the limits of each control, or in the controls' own units."""
     cell: Annotated[tuple[str, ...], optional("CELL ...")] = ()
-    """Cells of a stress test, as in `lqrsim replay`. By default all."""
+    """Cells of a stress test, as in `lqrsim replay`, all with one plan. By default all cells."""
     solution: Annotated[Path | None, optional("SOLUTION.npz")] = None
-    """Solution of the run. By default solution.npz beside it."""
+    """Solution of the run. By default solution.npz beside it, or that of the cells."""
     scenario: Annotated[str | None, optional("SCENARIO")] = None
     """Scenario of the run, for the rewards, as in `lqrsim simulate` or `lqrsim replay`."""
     json: Json = False
@@ -345,7 +347,7 @@ class Export:
     def run(self) -> int:
         if (self.c is None) == (self.minari is None):
             raise ls.InputError(f"--c, --minari: got {'none' if self.c is None else 'both'}, want one of the two")
-        unused, target = (OF_C, "--c") if self.c is None else (OF_MINARI, "--minari")
+        unused, target = (C_OPTIONS, "--c") if self.c is None else (MINARI_OPTIONS, "--minari")
         refuse(self, unused, f"without {target}, want it with that")
         if self.c is not None:
             self._to_c(self.c)
@@ -364,17 +366,19 @@ class Export:
 
     def _to_minari(self, name: str) -> None:
         try:
-            from lqrsim.gym import make_env, write_minari
+            from lqrsim.gym import make_env, same_plan, write_minari
         except ImportError as error:
             raise ls.InputError(f"--minari: {error}, and 'lqrsim[minari]'") from None
         if self.source.is_dir():
             results = ls.stress.Results(self.source, scenario=self.scenario)
             cells = [ls.stress.Cell.named(cell_name, results.cells) for cell_name in self.cell] or results.cells
+            plans = {cell.policy: results.solution(cell.policy).trajectory for cell in cells}
+            if not all(same_plan(plan, plans[cells[0].policy]) for plan in plans.values()):
+                raise ls.InputError(f"--cell: got cells of {', '.join(plans)} with several plans, want one plan")
             shards = ((cell, shard) for cell in cells for shard in results.shards(cell))
             runs = (ls.stress.replay(results, cell, one.first, trials=one.count, frames=False) for cell, one in shards)
             solution = self.solution or results.folder / "policies" / f"{cells[0].policy}.npz"
-            named = self.scenario or results.manifest.settings.scenario
-            _ = results.campaign  # raises an exception if that is code which was not named
+            named = results.campaign.scenario  # an InputError if it is code and --scenario does not name it
         else:
             if self.cell:
                 raise ls.InputError(f"--cell: got {self.cell[0]} with {self.source}, want the folder of a stress test")

@@ -17,7 +17,7 @@ from lqrsim.errors import (
     check_flag,
     check_memory,
     check_number,
-    check_weight,
+    check_weight_matrix,
     keep,
     numbers_of,
 )
@@ -54,7 +54,7 @@ class _SquareCost(Cost):
 
     def _checked(self, weight: Any, about: Any) -> tuple[Array, Array]:
         """Weight ([K,] n, n) and reference ([K,] n), each with or without one row for each of K knots."""
-        weight = check_weight(f"{self.name}: weight", weight, definite=self.controls)
+        weight = check_weight_matrix(f"{self.name}: weight", weight, definite=self.controls)
         field, size = f"{self.name}: about", weight.shape[-1]
         about = np.zeros(size) if about is None else numbers_of(field, about, f"numbers of shape ({size},)")
         about = check_array(field, about, (None, size) if about.ndim == 2 else (size,))

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from lqrsim.annotations import OneOf, checked
 from lqrsim.codegen.sources import source_of
-from lqrsim.errors import Array, InputError, check_array, check_name, check_text, check_weights
+from lqrsim.errors import Array, InputError, check_array, check_name, check_text, check_weight_vector
 from lqrsim.kernels.declarations import N, at, call, int32, stack, store
 from lqrsim.kernels.linear_algebra import clear
 from lqrsim.kernels.mjcf_dynamics import (
@@ -117,7 +117,7 @@ class SiteCost(_OfSite, Cost):
     ) -> None:
         self._set_place(site, position, orientation)
         self.weights = tuple(
-            check_weights(f"SiteCost: {name}", values, 3)
+            check_weight_vector(f"SiteCost: {name}", values, 3)
             for name, values in (("weight", weight), ("turn_weight", turn_weight))
         )
 

@@ -18,7 +18,7 @@ from lqrsim.errors import (
     check_items,
     check_name,
     check_number,
-    check_weights,
+    check_weight_vector,
     excerpt,
     listed,
     renamed,
@@ -366,7 +366,7 @@ class MjcfRobot(Robot):
         at_start, at_goal = self._held(start), self._held(goal)
         about = (at_start.controls + at_goal.controls) / 2 if at_start.held and at_goal.held else at_start.controls
         effort = self.mjcf.efforts**-2.0 if effort is None else effort
-        of_controls = effort if isinstance(effort, Mapping) else check_weights("effort", effort, len(controls))
+        of_controls = effort if isinstance(effort, Mapping) else check_weight_vector("effort", effort, len(controls))
         cost: Cost = ControlCost(of_controls, about=about)
         state_weights, about_state, root = np.zeros(n), np.zeros(n), model.body_rootid[dynamics.physics.body]
         for joint in self.mjcf.joints:
@@ -423,7 +423,7 @@ class MjcfRobot(Robot):
         rolling = [wheel.dof for wheel in self.mjcf.wheels if start[wheel.dof] == goal[wheel.dof]]
         if isinstance(weights, Mapping):
             return {**{names[dof]: 0.0 for dof in rolling}, **weights}
-        numbers = check_weights("weights", weights, len(names))
+        numbers = check_weight_vector("weights", weights, len(names))
         if np.ndim(weights) == 0:
             numbers[rolling] = 0.0
         return numbers

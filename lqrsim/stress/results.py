@@ -63,7 +63,7 @@ _METHOD = {
 
 @dataclass(frozen=True)
 class CellSummary:
-    """What the trials of a cell say so far, by the shards that it has: small, unlike their rows."""
+    """What the shards on disk say of a cell's trials: small, unlike their rows, so that it is kept in memory."""
 
     shards: list[Shard]
     tally: Counter[str]  # the number of trials of each outcome
@@ -150,11 +150,11 @@ class Results:
 
     def summary(self) -> str:
         """A line per cell with success rate, interval and outcomes; then where the plans end, and errors."""
-        width = max(len(name) for name in ["sweep", *self.manifest.settings.sweeps])
-        wide = max(10, *(len(policy) for policy in self.manifest.policies))
+        sweep_width = max(len(name) for name in ["sweep", *self.manifest.settings.sweeps])
+        policy_width = max(10, *(len(policy) for policy in self.manifest.policies))
         others = [name for name in OUTCOMES if name != "reached"]
         interval = f"reached, {100 * CONFIDENCE:g} % interval"
-        head = f"{'sweep':<{width}} {'strength':>8} {'policy':<{wide}} {interval:>33}"
+        head = f"{'sweep':<{sweep_width}} {'strength':>8} {'policy':<{policy_width}} {interval:>33}"
         lines = [head + "".join(f" {name:>9}" for name in others)]
         for cell, so_far in self.cell_summaries().items():
             if (success := so_far.success) is None:
@@ -162,12 +162,12 @@ class Results:
             exact, reached = success.exact, f"{success.reached}/{success.trials}"
             rate = f"{100 * exact.value:5.1f} [{100 * exact.low:5.1f}, {100 * exact.high:5.1f}]"
             rate = f"{reached:>13} {'deterministic: 1 run' if success.alike else rate}"
-            line = f"{cell.sweep:<{width}} {cell.strength:>8g} {cell.policy:<{wide}} {rate:>33}"
+            line = f"{cell.sweep:<{sweep_width}} {cell.strength:>8g} {cell.policy:<{policy_width}} {rate:>33}"
             lines.append(line + "".join(f" {so_far.tally[name]:>9}" for name in others))
         lines += [self.manifest.left_out] if self.manifest.left_out else []
         designs = (f"{policy}: {text}" for policy, text in self.designs().items())
         lines += [*self.manifest.remarks, *designs, *self.plans()]
-        lines += [*self.came_to_nothing(), *self.hints()]
+        lines += [*self.stop_reasons(), *self.hints()]
         return "\n".join(lines)
 
     def rates(self) -> DataTable:
@@ -201,7 +201,7 @@ class Results:
         return self.rates()._repr_html_()
 
     def designs(self) -> dict[str, str]:
-        """For which disturbances each policy was designed that is designed for any, by policy."""
+        """The disturbances for which each policy was designed, in words. Policies designed for none are left out."""
         stated, designs = self.manifest.campaign["design_disturbances"], dict[str, str]()
         disturbances = f"the preset {DEFAULT_DESIGN}"
         if stated is not None:  # as it is written in Python
@@ -215,7 +215,7 @@ class Results:
                 designs[policy] = "designed anew for the disturbances of each cell, at their strength"
         return designs
 
-    def came_to_nothing(self) -> list[str]:
+    def stop_reasons(self) -> list[str]:
         """A line for each of the most frequent reasons of trials that ended with an error or diverged."""
         reasons: Counter[str] = Counter()
         for so_far in self.cell_summaries().values():
@@ -337,12 +337,14 @@ def replay(
     frames: bool = True,
     contacts: bool = True,
 ) -> Rollout:
-    """Run trials of a campaign again: bit-identical until they end, and without contacts until the plan ends.
+    """Run trials of a campaign again: bit-identical until they end.
 
     It needs the kind of processor and the versions in `results.manifest.versions`.
 
     Args:
-      contacts: whether obstacles stop the robot.
+      frames: whether to record what pictures need.
+      contacts: whether obstacles stop the robot. They did not in the campaign, so that without contacts the run is
+        bit-identical until the plan ends.
     """
     results = results if isinstance(results, Results) else Results(results)
     results.number(cell)  # raises InputError unless the campaign has it
@@ -423,8 +425,8 @@ def compare(
     firsts = {cell: results[0].outcomes(cell).first(counts[0]) for cell, _ in pairs}
     seconds = {cell: results[1].outcomes(cell).first(counts[1]) for _, cell in pairs}
     comparisons = analysis.compare_cells(pairs, firsts, seconds, paired=paired)
-    of = [f"{policy} of " for policy in chosen] or ["", ""]
-    notes = [f"first: {of[0]}{results[0].folder}; second: {of[1]}{results[1].folder}"]
+    prefixes = [f"{policy} of " for policy in chosen] or ["", ""]
+    notes = [f"first: {prefixes[0]}{results[0].folder}; second: {prefixes[1]}{results[1].folder}"]
     differ = [name for name in _SETTINGS if manifests[0].campaign[name] != manifests[1].campaign[name]]
     differ += [name for name in _FIELDS if getattr(manifests[0], name) != getattr(manifests[1], name)]
     notes += [f"they differ in {', '.join(differ)}"] if differ else []
@@ -483,7 +485,7 @@ class Manifest:
 
     @classmethod
     def of(cls, said: Mapping[str, Any]) -> "Manifest":
-        """The manifest of an object of JSON. Raises InputError unless all fields are valid and the hashes fit."""
+        """The manifest of a JSON object. Raises InputError unless all fields are valid and the hashes fit."""
         _check_names("manifest", said, [field.name for field in fields(cls)])
         manifest = cls(**said)
         if manifest.sha256 != sha256(canonical({name: value for name, value in said.items() if name != "sha256"})):
@@ -492,9 +494,9 @@ class Manifest:
         cells = [[cell.policy, cell.sweep, cell.strength] for cell in manifest.settings.cells]
         if canonical(manifest.cells) != canonical(cells):
             raise InputError("cells: got cells of another campaign, want each sweep, strength and policy")
-        pairs, fixed = [[sweep, strength] for _, sweep, strength in cells], manifest.deterministic
-        if not isinstance(fixed, list) or any(pair not in pairs for pair in fixed):
-            raise InputError(f"deterministic: got {excerpt(fixed)}, want a list of pairs of a sweep and a strength")
+        pairs, alike = [[sweep, strength] for _, sweep, strength in cells], manifest.deterministic
+        if not isinstance(alike, list) or any(pair not in pairs for pair in alike):
+            raise InputError(f"deterministic: got {excerpt(alike)}, want a list of pairs of a sweep and a strength")
         policies = manifest.settings.policies
         if set(manifest.policies) != set(policies):
             raise InputError(f"policies: got {', '.join(manifest.policies)}, want {', '.join(policies)}")
@@ -533,7 +535,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def _check_names(field: str, part: Mapping[str, Any], names: Sequence[str]) -> None:
-    """Raise InputError unless an object of JSON has exactly these fields."""
+    """Raise InputError unless a JSON object has exactly these fields."""
     if wrong := sorted(part.keys() ^ set(names)):
         got = f"{'' if wrong[0] in part else 'none of '}{excerpt(wrong[0])}"
         raise InputError(f"{field}: got {got}, want exactly {', '.join(names)}")
@@ -641,7 +643,7 @@ def _chunks(contents: bytes) -> list[list[tuple[int, int]]]:
 
     Raises an exception of any kind where the footer is damaged.
 
-    PyArrow's own objects of a footer end the process where it is damaged, so it is read here, as far as it bounds the
+    PyArrow's own footer objects crash the process if the footer is damaged, so it is read here, as far as it bounds the
     memory that a file takes. The format is Thrift's compact protocol: https://github.com/apache/parquet-format and
     https://github.com/apache/thrift/blob/master/doc/specs.
     """

@@ -44,7 +44,7 @@ def rate(
 
 
 @dataclass(frozen=True)
-class Pairs:
+class PairedComparison:
     """A comparison of two policies on the same trials, with the exact McNemar test."""
 
     only_first: int
@@ -52,7 +52,7 @@ class Pairs:
     p_value: float  # of a split that is at least as uneven, if both policies were equally good
 
 
-def compare(first: npt.ArrayLike, second: npt.ArrayLike) -> Pairs:
+def compare(first: npt.ArrayLike, second: npt.ArrayLike) -> PairedComparison:
     """Compare two policies trial by trial; `first` and `second` (K,) say whether each trial succeeded."""
     from scipy import stats
 
@@ -62,7 +62,7 @@ def compare(first: npt.ArrayLike, second: npt.ArrayLike) -> Pairs:
     only_first, only_second = int(np.sum(first_flags & ~second_flags)), int(np.sum(second_flags & ~first_flags))
     different = only_first + only_second
     p_value = float(stats.binomtest(only_first, different).pvalue) if different else 1.0
-    return Pairs(only_first, only_second, p_value)
+    return PairedComparison(only_first, only_second, p_value)
 
 
 def _flags(field: str, values: npt.ArrayLike) -> npt.NDArray[np.bool_]:
@@ -105,7 +105,7 @@ def paired_difference(
 
 
 def independent_difference(first: tuple[int, int], second: tuple[int, int]) -> tuple[Estimate, float]:
-    """The difference of two success rates, (successes, trials), of trials apart, and Fisher's exact test of it.
+    """The difference of two success rates, (successes, trials), of independent trials, and Fisher's exact test of it.
 
     The interval is Newcombe's hybrid score (Statistics in Medicine 17, 1998, method 10): how far the rates can be off
     by their Wilson intervals, added as independent errors are.
@@ -138,9 +138,9 @@ def mean(sample: npt.ArrayLike) -> Estimate:
     numbers = check_array("sample", sample, (None,))
     if len(numbers) < 2:
         raise InputError(f"sample: got {len(numbers)} numbers, want at least 2")
-    reach = stats.t.ppf(0.5 + CONFIDENCE / 2, len(numbers) - 1) * numbers.std(ddof=1) / np.sqrt(len(numbers))
+    half_width = stats.t.ppf(0.5 + CONFIDENCE / 2, len(numbers) - 1) * numbers.std(ddof=1) / np.sqrt(len(numbers))
     middle = float(numbers.mean())
-    return Estimate(middle, middle - float(reach), middle + float(reach))
+    return Estimate(middle, middle - float(half_width), middle + float(half_width))
 
 
 def holm(p_values: npt.ArrayLike) -> Array:
@@ -154,5 +154,5 @@ def holm(p_values: npt.ArrayLike) -> Array:
 
 
 def rounded(number: float) -> str:
-    """The number with two significant digits, without an exponent below 1e9."""
-    return f"{float(f'{number:.2g}'):,.0f}" if number < 1e9 else f"{number:.2g}"
+    """The number with two significant digits, without an exponent from 1e-4 to 1e9."""
+    return f"{float(f'{number:.2g}'):,.15g}" if number < 1e9 else f"{number:.2g}"

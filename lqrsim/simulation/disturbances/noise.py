@@ -26,7 +26,7 @@ from lqrsim.simulation.disturbances.base import (
 )
 from lqrsim.simulation.plant import Plant
 
-READINGS, DEVIATIONS = "readings", "standard deviations"  # of a belief, by which `read` has them
+READINGS, DEVIATIONS = "readings", "standard deviations"  # keys under which `Effect.read` gets those of a belief
 SETTINGS = tuple(field.name for field in fields(Sensor)[1:])  # all but the name
 
 
@@ -281,42 +281,44 @@ class SensorErrors(Disturbance):
         keep(self, sensors=by_name)
 
     @cached_property
-    def known(self) -> tuple[Sensor, ...]:
+    def sensor_records(self) -> tuple[Sensor, ...]:
         sensors: Any = self.sensors
         return tuple(Sensor(name, **settings) for name, settings in sensors.items())
 
     def check(self, plant: Plant) -> None:
-        plant.sensors(self.known)
+        plant.sensors(self.sensor_records)
 
     def describe(self, plant: Plant) -> str:
         listed = (
             f"{sensor.name} (noise {sensor.noise:g}, bias {sensor.bias:g} and {sensor.bias_walk:g} in 1 s,"
             f" loss {sensor.loss:g})"
-            for sensor in plant.sensors(self.known).sensors
+            for sensor in plant.sensors(self.sensor_records).sensors
         )
         return f"errors of sensors, times {self.strength:g}: {', '.join(listed)}"
 
     def start(self, plant: Plant, plan: Trajectory, generators: Sequence[np.random.Generator]) -> Effect:
-        known, knots = plant.sensors(self.known), plan.steps + 1
-        size = len(known.names)
-        errors = known.per_reading("noise") * normal(generators, knots, size)
-        errors += known.per_reading("bias") * normal(generators, 1, size)
+        sensors, knots = plant.sensors(self.sensor_records), plan.steps + 1
+        size = len(sensors.names)
+        errors = sensors.per_reading("noise") * normal(generators, knots, size)
+        errors += sensors.per_reading("bias") * normal(generators, 1, size)
         walks = normal(generators, plan.steps, size).cumsum(axis=1)
-        errors[:, 1:] += known.per_reading("bias_walk") * np.sqrt(plan.dt) * walks
-        losses = np.array([sensor.loss for sensor in known.sensors])
+        errors[:, 1:] += sensors.per_reading("bias_walk") * np.sqrt(plan.dt) * walks
+        losses = np.array([sensor.loss for sensor in sensors.sensors])
         lost = uniform(generators, knots, len(losses)) < self.strength * losses
         errors *= self.strength
-        for i, columns in enumerate(known.columns):
+        for i, columns in enumerate(sensors.columns):
             errors[..., columns][lost[..., i]] = np.nan
-        of = {sensor.name: errors[..., columns] for sensor, columns in zip(known.sensors, known.columns, strict=True)}
+        parts = zip(sensors.sensors, sensors.columns, strict=True)
+        by_sensor = {sensor.name: errors[..., columns] for sensor, columns in parts}
 
         def read(step: int, readings: dict[str, Array]) -> dict[str, Array]:
-            return {name: reading + of[name][:, step] if name in of else reading for name, reading in readings.items()}
+            both = by_sensor.keys() & readings
+            return readings | {name: readings[name] + by_sensor[name][:, step] for name in both}
 
         return Effect(read=read)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return self._left_out(plant, "OffsetFree has them by its own sensors=", acts=self.strength > 0)
+        return self._left_out(plant, "OffsetFree takes them from its sensors=", acts=self.strength > 0)
 
 
 @checked
@@ -354,4 +356,4 @@ class ReadingErrors(Disturbance):
         return Effect(read=read)
 
     def uncertainty(self, plant: Plant) -> Uncertainty:
-        return self._left_out(plant, "a BeliefFeedback has them by its belief", acts=self.strength > 0)
+        return self._left_out(plant, "a BeliefFeedback takes them from its belief", acts=self.strength > 0)
