@@ -52,7 +52,6 @@ from lqrsim.errors import (
 from lqrsim.results.coordinates import Spaces, check_same_system, spaces_of
 from lqrsim.results.rollout import Rollout
 from lqrsim.results.solution import Solution
-from lqrsim.results.solution_parts import Trajectory
 from lqrsim.scenarios.packaged import Scenario
 from lqrsim.scenarios.references import disturbance_set, resolve
 from lqrsim.scenarios.solutions import check_solution, remarks, solve
@@ -367,8 +366,7 @@ class Environment(Resettable, gymnasium.Env[Any, Any]):
         self.render_mode = render_mode
         self._picture = LivePicture(camera, size)
         self.action_space, self.observation_space = self.task.action_space(), self.task.observation_space()
-        fps = max(round(1 / self.task.scenario.problem.dt), 1)
-        self.metadata = {**type(self).metadata, "render_fps": fps}
+        self.metadata = {**type(self).metadata, "render_fps": max(round(1 / self.task.scenario.problem.dt), 1)}
 
     @checked
     def reset(self, *, seed: Seed | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
@@ -620,11 +618,6 @@ def _removed_on_failure(folder: Path) -> Iterator[None]:
         raise
 
 
-def same_plan(first: Trajectory, second: Trajectory) -> bool:
-    pairs = (first.states, second.states), (first.controls, second.controls)
-    return first.dt == second.dt and all(np.array_equal(*pair) for pair in pairs)
-
-
 def _runs_of(task: Task, rollouts: Iterable[Any]) -> Iterator[Rollout]:
     """The runs. Raises InputError unless each is a run of the task's plan."""
     wanted = "a Rollout, or several, such as simulate(...) returns"
@@ -634,7 +627,9 @@ def _runs_of(task: Task, rollouts: Iterable[Any]) -> Iterator[Rollout]:
     for rollout in rollouts:
         run_plan = check_kind("rollouts", rollout, Rollout, wanted).plan
         check_same_system("rollouts", "a run", spaces_of(rollout), system, "the environment")
-        if not same_plan(run_plan, plan):
+        if run_plan.dt != plan.dt or not all(
+            map(np.array_equal, (run_plan.states, run_plan.controls), (plan.states, plan.controls))
+        ):
             raise InputError("rollouts: got runs of another plan than env's, want env to have their solution=")
         yield rollout
 

@@ -226,5 +226,5 @@ def test_cells_are_of_one_plan(
         words = ["export", "campaign", "--minari", f"run/n{number}-v0", *(["--cell", *cells] if cells else [])]
         assert main(words) == (0 if len(plans) == 1 else 2)
         said = capsys.readouterr()
-        assert said.err.startswith("lqrsim: error: --cell: got cells of ") == (len(plans) == 2)
+        assert said.err.startswith("lqrsim: error: --cell: got cells with plans of ") == (len(plans) == 2)
         assert (f"\n{2 * len(chosen)} episodes" in said.out) == (len(plans) == 1)

@@ -195,7 +195,7 @@ class View:
             scenario = resolve(self.what)
             self._check_replanning(scenario.problem)
             given = self.solution
-            solution = self._load_solution(scenario, given) if given else console.solve_and_print(scenario)
+            solution = console.solve_and_print(scenario) if given is None else self._load_solution(scenario, given)
             scenario = scenario.with_duration_of(solution)
             self._check_replanning(scenario.problem)
             plant = scenario.plant()
@@ -366,15 +366,15 @@ class Export:
 
     def _to_minari(self, name: str) -> None:
         try:
-            from lqrsim.gym import make_env, same_plan, write_minari
+            from lqrsim.gym import make_env, write_minari
         except ImportError as error:
             raise ls.InputError(f"--minari: {error}, and 'lqrsim[minari]'") from None
         if self.source.is_dir():
             results = ls.stress.Results(self.source, scenario=self.scenario)
             cells = [ls.stress.Cell.named(cell_name, results.cells) for cell_name in self.cell] or results.cells
-            plans = {cell.policy: results.solution(cell.policy).trajectory for cell in cells}
-            if not all(same_plan(plan, plans[cells[0].policy]) for plan in plans.values()):
-                raise ls.InputError(f"--cell: got cells of {', '.join(plans)} with several plans, want one plan")
+            solvers = dict.fromkeys(results.solution(cell.policy).solver for cell in cells)  # each has its own plan
+            if len(solvers) > 1:
+                raise ls.InputError(f"--cell: got cells with plans of {' and '.join(solvers)}, want those of one plan")
             shards = ((cell, shard) for cell in cells for shard in results.shards(cell))
             runs = (ls.stress.replay(results, cell, one.first, trials=one.count, frames=False) for cell, one in shards)
             solution = self.solution or results.folder / "policies" / f"{cells[0].policy}.npz"

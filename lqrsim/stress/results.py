@@ -132,8 +132,7 @@ class Results:
     def _read(self, cell: Cell, shards: list[Shard]) -> tuple[Outcomes, CellSummary]:
         """The outcomes in these shards of a cell, and their summary."""
         tables = [self.table(shard) for shard in shards]
-        names = [name for name in tables[0] if name != "reason"]
-        columns: dict[str, Any] = {name: np.concatenate([table[name] for table in tables]) for name in names}
+        columns: dict[str, Any] = {name: np.concatenate([table[name] for table in tables]) for name in COLUMNS}
         deterministic = not cell.strength or [cell.sweep, cell.strength] in self.manifest.deterministic
         found = Outcomes(**columns, deterministic=deterministic)
         reasons = Counter(reason for table in tables for reason in table["reason"].tolist() if reason)
@@ -166,8 +165,7 @@ class Results:
             lines.append(line + "".join(f" {so_far.tally[name]:>9}" for name in others))
         lines += [self.manifest.left_out] if self.manifest.left_out else []
         designs = (f"{policy}: {text}" for policy, text in self.designs().items())
-        lines += [*self.manifest.remarks, *designs, *self.plans()]
-        lines += [*self.stop_reasons(), *self.hints()]
+        lines += [*self.manifest.remarks, *designs, *self.plans(), *self.stop_reasons(), *self.hints()]
         return "\n".join(lines)
 
     def rates(self) -> DataTable:
@@ -343,8 +341,7 @@ def replay(
 
     Args:
       frames: whether to record what pictures need.
-      contacts: whether obstacles stop the robot. They did not in the campaign, so that without contacts the run is
-        bit-identical until the plan ends.
+      contacts: whether obstacles stop the robot. Without, as in the campaign, it is identical until the plan ends.
     """
     results = results if isinstance(results, Results) else Results(results)
     results.number(cell)  # raises InputError unless the campaign has it

@@ -308,8 +308,7 @@ class SensorErrors(Disturbance):
         errors *= self.strength
         for i, columns in enumerate(sensors.columns):
             errors[..., columns][lost[..., i]] = np.nan
-        parts = zip(sensors.sensors, sensors.columns, strict=True)
-        by_sensor = {sensor.name: errors[..., columns] for sensor, columns in parts}
+        by_sensor = {sensor.name: errors[..., sensors.columns[i]] for i, sensor in enumerate(sensors.sensors)}
 
         def read(step: int, readings: dict[str, Array]) -> dict[str, Array]:
             both = by_sensor.keys() & readings
