@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -634,6 +635,19 @@ def test_from_a_start_thrown_far_off_the_merit_falls(far: float) -> None:
     assert found.solved
     # No control is at its limit; relative to the largest, for rounding is.
     np.testing.assert_allclose(found.plan.controls[:, 0], best, rtol=0, atol=1e-10 * np.abs(best).max())
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=examples(10))
+def test_a_result_stays_as_it_is_when_another_run_uses_its_memory(seed: int) -> None:
+    rng, stages = np.random.default_rng(seed), Stages(problem())
+    plans = [Motion(rng.normal(size=(16, 2)), rng.normal(size=(15, 1))) for _ in range(2)]
+    first = InteriorPoint(stages, plans[0]).run(tolerance=1e-8, violation=1e-6, most=20)
+    before = deepcopy(first)
+    InteriorPoint(stages, plans[1]).run(tolerance=1e-8, violation=1e-6, most=2)
+    for name in ("plan", "gain", "multipliers", "pressing", "sizes"):
+        for found, wanted in zip(getattr(first, name), getattr(before, name), strict=True):
+            np.testing.assert_array_equal(found, wanted)
 
 
 def pole(length: float, fastest: float, steps: int, *, held: bool) -> ls.Problem:

@@ -1360,7 +1360,7 @@ class TestPlanMethods:
         stages, plan = self.made(**({"initial": ls.FixedState([0.0, 0.0, 0.3])} if informed else {}))
         stages.about = stages.about._replace(learns=learns)
         InteriorPoint(stages, plan, price=price)
-        stages.state(margin=1e-9)
+        stages.set_prices_and_margins(margin=1e-9)
         known = np.abs(stages.about.rows.numbers) if informed else np.zeros(stages.live.size)
         begun = PlanBeginning(plan, known, informed, 1.0, 0.02, 0.0)
         work, memory = stages.interior
@@ -1432,7 +1432,7 @@ class TestPlanMethods:
         stages, plan = self.made()
         work, memory = stages.active_set
         work.plan.states[...], work.plan.controls[...] = plan
-        stages.state(price=np.inf, margin=1e-9)
+        stages.set_prices_and_margins(price=np.inf, margin=1e-9)
         rng = np.random.default_rng(1)
         stages.force[...] = stages.live * rng.uniform(-0.1, 1.0, size=stages.live.shape)
 
@@ -1444,7 +1444,7 @@ class TestPlanMethods:
         run(active_set.PREPARE)
         outcomes = {run(active_set.PIVOT) for _ in range(40)}
         assert outcomes & {declarations.CONVERGED, declarations.STALLED}
-        stages.state(price=0.1)
+        stages.set_prices_and_margins(price=0.1)
         stages.held[:, 0] = stages.live[:, 0] * active_set.PAID
         stages.force[:, 0] = 0.1 * stages.live[:, 0]
         run(active_set.PREPARE)

@@ -18,7 +18,12 @@ import lqrsim as ls
 from lqrsim.codegen.compiled_module import compilations
 from lqrsim.codegen.plain import plain_functions
 from lqrsim.errors import Array, InputError
+from lqrsim.solvers.assembly import assemble
+from lqrsim.solvers.budget import Budget
+from lqrsim.solvers.certify import certified
 from lqrsim.solvers.compiled import costs_of
+from lqrsim.solvers.engine import SolveRun
+from lqrsim.solvers.settings import SmootherSettings, resolve
 
 FORMS = [(True, "dual"), (False, "dual"), pytest.param(False, "primal", marks=pytest.mark.long)]
 
@@ -108,6 +113,26 @@ def test_the_risk_that_is_too_high_is_named():
         assert solver(problem, risk=will_do).success
     # What has no noise to speak of is never too risky.
     assert ls.largest_risk(problem_of(numbers, noise=ls.Noise(0 * numbers.e.T)), solution) == np.inf
+
+
+@settings(max_examples=examples(8))
+@given(seed=st.integers(0, 2**32 - 1))
+def test_the_risk_is_named_after_the_plan_is_copied(seed):
+    """To name it, the memory is overwritten in which the plan is: with the last one where no plan was best."""
+    numbers = draw(np.random.default_rng(seed), multiplicative=0.0)
+    problem = problem_of(numbers, noise=ls.Noise(numbers.e.T), risk=1e3)
+    guess, start = resolve(None, problem), np.asarray(problem.start)
+    run = SolveRun(problem, SmootherSettings(), guess, start, Budget(5))
+    run.smooth(1)
+    run.work.best.states[...], run.work.best.controls[...] = 1.0, 2.0
+    run.work.memory["plan_cost"] = np.inf
+    result = certified(
+        run, dataclasses.replace(run.result(run.ending), status=ls.Status.RISK_TOO_HIGH, plan=run.work.best)
+    )
+    before = result.kept()
+    solution = assemble(run, result, solver="smooth", options={"stop": "optimal"})
+    for found, wanted in zip((solution.trajectory.states, solution.trajectory.controls), before.plan, strict=True):
+        np.testing.assert_array_equal(found, wanted)
 
 
 @pytest.mark.parametrize("times", [1.05, 3.0])

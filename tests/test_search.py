@@ -14,9 +14,13 @@ from sampling import examples
 
 import lqrsim as ls
 from lqrsim.errors import Array
+from lqrsim.kernels.records import Motion, Policy
 from lqrsim.results.solution_parts import Iteration, Status
-from lqrsim.solvers import strategy
+from lqrsim.solvers import contact_modes, strategy
+from lqrsim.solvers.budget import Stop
+from lqrsim.solvers.engine import RunResult, SolveRun
 from lqrsim.solvers.multistart import bends, guides, path, reweighted
+from lqrsim.solvers.settings import SmootherSettings
 from lqrsim.solvers.stages import Stages
 
 STARTS = ["straight", *(f"{far} m to the {side}" for far in (1, 2, 3) for side in ("left", "right"))]
@@ -252,6 +256,45 @@ def test_a_first_plan_is_the_answer_only_where_the_other_attempts_change_nothing
         assert same(one, other)
         assert (one.detail, one.remedy, one.options) == (other.detail, other.remedy, other.options)
         assert [each.start for each in one.candidates] == [each.start for each in other.candidates]
+
+
+def a_result(problem: ls.Problem, status: Status, **changed: Any) -> RunResult:
+    n, m = len(problem.dynamics.state_coordinates), len(problem.control_coordinates)
+    plan = Motion(np.zeros((problem.steps + 1, n)), np.zeros((problem.steps, m)))
+    return RunResult(status=status, plan=plan, policy=Policy(np.zeros((problem.steps, m, n)), plan.controls), **changed)
+
+
+@given(data=st.data())
+@settings(max_examples=examples(100))
+def test_a_plan_that_was_preferred_stays_the_best_until_a_better_one_is_found(data: st.DataObject) -> None:
+    """Such as a plan that has not converged, but costs less than doing nothing, when others follow that do nothing."""
+    runs = strategy.Runs(problem := in_the_plane(), SmootherSettings(), Stop())
+    best: RunResult | None = None
+    for _ in range(data.draw(st.integers(1, 8))):
+        status = data.draw(st.sampled_from([Status.CONVERGED, Status.STALLED, Status.INFEASIBLE]))
+        violation, cost = data.draw(st.sampled_from([0.0, 0.5])), float(data.draw(st.integers(1, 4)))
+        result = a_result(problem, status, violation=violation, cost=cost)
+        preferred = data.draw(st.sampled_from([None, True, False]))
+        outranks = all(result.rank < other.rank for _, other in runs.finished)
+        runs.offer(runs.another(None), result, better=preferred)
+        best = result if best is None or (outranks if preferred is None else preferred) else best
+        assert runs.best is best
+
+
+@pytest.mark.parametrize("detail", ["", "no step lowers the cost", "the undamped method failed (diverged); stalled"])
+@pytest.mark.parametrize("origin", ["", "begun with contacts of softness 8 mm, 2 mm"])
+def test_a_plan_within_contact_modes_says_with_what_it_began_and_not_how_that_ended(
+    detail: str, origin: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def keep_modes(run: SolveRun, plan: RunResult) -> RunResult:
+        return a_result(run.problem, Status.CONVERGED, detail="within its contact modes", cost=1.0)
+
+    monkeypatch.setattr(contact_modes, "keep_modes", keep_modes)
+    runs = strategy.Runs(problem := in_the_plane(), SmootherSettings(), Stop())
+    begin = a_result(problem, Status.STALLED, detail=detail, origin=origin, cost=2.0)
+    runs.offer(runs.another(None), begin)
+    assert strategy.Softening(runs, strategy.Approaches(runs))._keep_modes(begin)
+    assert (runs.best.origin, runs.best.detail) == (origin, "within its contact modes")
 
 
 class TestConstraintsInTheWay:

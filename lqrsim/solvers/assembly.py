@@ -3,7 +3,6 @@
 import itertools
 import math
 from collections.abc import Sequence
-from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 
@@ -11,7 +10,6 @@ import numpy as np
 
 from lqrsim.annotations import LINE
 from lqrsim.errors import Array, printable
-from lqrsim.kernels.records import Policy
 from lqrsim.machine import versions
 from lqrsim.problem.obstacles import each_once
 from lqrsim.problem.problem import Problem
@@ -47,18 +45,14 @@ def assemble(
     candidates: tuple[Candidate, ...] = (),
 ) -> Solution:  # fmt: skip
     """Copy the result of a run into a Solution."""
-    problem, log = run.problem, run.budget.log
+    problem, log, result = run.problem, run.budget.log, result.kept()  # what is told of a risk writes to the memory
     assert result.certificate is not None
     if result.status is Status.RISK_TOO_HIGH:
         result = replace(result, detail=_with_risk(run, result))
     falls = bool(log) and result.cost < -UNBOUNDED * max(1.0, abs(log[0].cost))
     if falls and not result.success and result.status is not Status.NOT_POSITIVE_DEFINITE:
         result = replace(result, status=Status.DIVERGED, detail="the cost falls without bound")
-    states, controls = map(np.copy, result.plan)
-    policy = Policy(*map(np.copy, result.policy))
-    inverse_policy = result.values.get("inverse_policy")
-    if inverse_policy is not None:
-        inverse_policy = Policy(*map(np.copy, inverse_policy))
+    (states, controls), inverse_policy = result.plan, result.values.get("inverse_policy")
     if problem.noise is not None:
         options = options | {"noise": repr(problem.noise), "risk": problem.risk}
     affine = partial(compiled.policy_of, problem)
@@ -67,7 +61,7 @@ def assemble(
     usable, remedy = "", shorter or result.remedy
     if not result.success:
         usable, remedy = _usable(problem, result, options), remedy_of(problem, result, log, options, shorter=shorter)
-    said = result.detail, usable, *doubts, unstable, _sites(problem, states)
+    said = result.origin, result.detail, usable, *doubts, unstable, _sites(problem, states)
     nominal = states.copy()  # a user may write to the states of the plan, as to convert angles for a plot
     later = {
         "inverse_policy": lambda: affine(*inverse_policy, nominal[1:]) if inverse_policy is not None else None,
@@ -80,9 +74,9 @@ def assemble(
         status=result.status,
         detail=joined(*said),
         remedy=remedy,
-        policy=affine(*policy, nominal[:-1]),
-        cost_to_go=deepcopy(result.values.get("cost_to_go")),
-        cost_to_come=deepcopy(result.values.get("cost_to_come")),
+        policy=affine(*result.policy, nominal[:-1]),
+        cost_to_go=result.values.get("cost_to_go"),
+        cost_to_come=result.values.get("cost_to_come"),
         trajectory=Trajectory(states, controls, problem.dt),
         iterations=tuple(log),
         certificate=result.certificate,
@@ -120,22 +114,24 @@ def parts_of(problem: Problem) -> dict[str, str]:
 
 def _usable(problem: Problem, result: RunResult, options: dict[str, object]) -> str:
     """What the certificate says of a plan for which time or iterations ended, or empty if it misses a constraint."""
-    plan, tolerance, allowed = result.certificate, options.get("tolerance"), options.get("constraint_tolerance")
-    if result.status not in (Status.TIME_LIMIT, Status.MAX_ITERATIONS) or plan is None or not np.isfinite(plan.cost):
+    checked, tolerance, allowed = result.certificate, options.get("tolerance"), options.get("constraint_tolerance")
+    unfinished = result.status in (Status.TIME_LIMIT, Status.MAX_ITERATIONS)
+    if not unfinished or checked is None or not np.isfinite(checked.cost):
         return ""
-    missed = plan.violation > (allowed if isinstance(allowed, float) else 0.0)
-    if missed or plan.start or plan.limits or not (plan.dynamics_residual <= MOTION and plan.policy_residual <= LAW):
+    missed = checked.violation > (allowed if isinstance(allowed, float) else 0.0)
+    sound = checked.dynamics_residual <= MOTION and checked.policy_residual <= LAW
+    if missed or checked.start or checked.limits or not sound:
         return ""
-    if np.isfinite(plan.optimality) and plan.optimality > UNFINISHED:
-        return f"the plan keeps dynamics, limits and constraints, but is far from an optimum ({plan.optimality:.1e})"
+    if np.isfinite(checked.optimality) and checked.optimality > UNFINISHED:
+        return f"the plan keeps dynamics, limits and constraints, but is far from an optimum ({checked.optimality:.1e})"
     target = Target(problem.dynamics.state_coordinates, problem.weighed_goal, result.states)
     use = "the plan can be used, for it keeps dynamics, limits and constraints"
     if target.misses_goal(target.radius_of_plan(goal_radius_of(problem, result.states))):
         use = "the plan keeps dynamics, limits and constraints, but misses the goal"
-    if not np.isfinite(plan.optimality):
+    if not np.isfinite(checked.optimality):
         return f"{use}; whether it is optimal is unknown"
     wanted = f", where {tolerance:g} is wanted" if isinstance(tolerance, float) else ""
-    return f"{use}; its cost could still fall by a relative {plan.optimality:.1e}{wanted}"
+    return f"{use}; its cost could still fall by a relative {checked.optimality:.1e}{wanted}"
 
 
 def _sites(problem: Problem, states: Array) -> str:
@@ -201,9 +197,9 @@ def _unstable_step(problem: Problem, states: Array, controls: Array, *, sound: b
     """What happens at the step at which a plan needs the shortest Runge-Kutta steps, and the remedy; or empty texts.
 
     A step of h seconds multiplies what has the eigenvalue L of df/dx by R(z) = 1 + z + z^2/2 + z^3/6 + z^4/24, z = hL.
-    If it decays, Re L < 0, but |R(z)| > 1, then a plan is one of the steps, and not of the system. If the plan is not
-    sound, the first such step is told: what follows may be beyond all bounds because of it. Empty if the same controls
-    lead there with shorter steps as well.
+    If it decays, Re L < 0, but |R(z)| > 1, the plan shows an instability of the integrator, not of the system. If the
+    plan is not sound, the first such step is reported: what follows may be beyond all bounds because of it. Empty if
+    the same controls lead there with shorter steps as well.
     """
     known = np.flatnonzero(np.isfinite(states[:-1]).all(axis=1) & np.isfinite(controls).all(axis=1))
     runge_kutta = problem.dynamics._runge_kutta(states[known], controls[known], problem.dt) if len(known) else None
@@ -298,11 +294,11 @@ def remedy_of(
         fell = log[-1].improvement * abs(log[-1].cost)
         costs = f"by {fell:.2g}; the plan costs {result.cost:.6g}"
         return f"raise max_iterations: the cost still fell in the last one, {costs}"
-    paper = options.get("finish", "newton") is None or options["stop"] == "cost"
+    without_exact_finish = options.get("finish", "newton") is None or options["stop"] == "cost"
     space = problem.control_coordinates
     bounded = bool(problem.constraints) or bool(np.isfinite([space.low, space.high]).any())
     helps = status is Status.NOT_POSITIVE_DEFINITE or (bounded and status is not Status.NOT_FINITE)
-    if paper and can_be_exact(problem) and helps and status is not Status.TIME_LIMIT:
+    if without_exact_finish and can_be_exact(problem) and helps and status is not Status.TIME_LIMIT:
         better = "the interior point" if bounded else "Newton's method"
         how = 'finish="newton" and stop="optimal"' if "form" in options else "smooth"  # iLQR has no finish
         return f"solve with {how}: {better} finds plans where this method does not"

@@ -119,7 +119,7 @@ def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool, 
 
     The multipliers may be `known` from another solution at first.
     """
-    work, log, most = run.work, run.budget.log, run.settings.gap_tolerance
+    work, log, gap_tolerance = run.work, run.budget.log, run.settings.gap_tolerance
     rows = np.zeros(min(ITERATIONS, max(run.budget.left, 1)), LOG)
     done, since, stale, nearest = 0, 0, 0, np.inf
     while True:
@@ -136,7 +136,7 @@ def _undamped(run: SolveRun, lagrangian: "AugmentedLagrangian", *, known: bool, 
             break
         # From the optimum without constraints they soon settle or cycle. If they cycle, damped iterations are much
         # faster.
-        off = max(last.gap / most, last.violation / run.method.violation)
+        off = max(last.gap / gap_tolerance, last.violation / run.method.violation)
         stale = 0 if off < CLOSER * nearest else stale + 1
         nearest = min(off, nearest)
         if stale == patience and not known and run.settings.safeguard:
@@ -233,7 +233,7 @@ def _rounds(run: SolveRun, lagrangian: "AugmentedLagrangian", why: str) -> RunRe
 
 
 def _forces(multipliers: ConstraintMultipliers, values: Array) -> Array:
-    """The new multipliers: lambda - mu d, at least 0 for inequalities; 0 if the row is inactive."""
+    """The new multipliers: lambda - mu d, at most the price in size, not below 0 for inequalities; 0 if inactive."""
     acting = np.where(np.isinf(values), 0.0, values)
     least = -multipliers.price if multipliers.term.equality else 0.0
     forces = np.clip(multipliers.values - multipliers.penalty * acting, least, multipliers.price)
@@ -309,16 +309,16 @@ class AugmentedLagrangian:
             multipliers.values[...] = _forces(multipliers, values)
             short = np.abs(values).max(initial=0.0) if multipliers.term.equality else -values.min(initial=np.inf)
             missed[multipliers.term.equality] = max(missed[multipliers.term.equality], short)
-        worst = max(missed, key=lambda kind: missed[kind])
+        worst = max(missed, key=lambda equality: missed[equality])
         # Equalities that nearly hold can be met: they need a better inner minimum, not a larger penalty.
-        near = {kind: kind and short <= self._allowed for kind, short in missed.items()}
+        near = {equality: equality and short <= self._allowed for equality, short in missed.items()}
         self.stuck = self.stuck + 1 if missed[worst] > 0.9 * self._missed[worst] and not near[worst] else 0
-        for kind, tolerance in self._tolerance.items():
-            more = growth * self._grown[kind] <= LARGEST or not near[kind]
-            if more and missed[kind] > max(0.5 * self._missed[kind], tolerance):
-                self._grown[kind] *= growth
+        for equality, tolerance in self._tolerance.items():
+            more = growth * self._grown[equality] <= LARGEST or not near[equality]
+            if more and missed[equality] > max(0.5 * self._missed[equality], tolerance):
+                self._grown[equality] *= growth
                 for multipliers in self._constraints:
-                    multipliers.penalty *= growth if multipliers.term.equality == kind else 1.0
+                    multipliers.penalty *= growth if multipliers.term.equality == equality else 1.0
         self._missed = missed
 
     def added(self) -> float:
@@ -362,11 +362,11 @@ class AugmentedLagrangian:
     def _worst_of(self, which: int) -> tuple[int, int]:
         """Step and row of a constraint's worst violation: the first of several equal; for an equality, the last."""
         values, term = self._values[which], self._constraints[which].term
-        last = len(values) - 1 - int(np.abs(values[::-1]).argmax()) if term.equality else int(values.argmin())
-        return divmod(last, term.rows)
+        worst = len(values) - 1 - int(np.abs(values[::-1]).argmax()) if term.equality else int(values.argmin())
+        return divmod(worst, term.rows)
 
     def _stiffness(self, which: int) -> float:
-        """The cost of changing the worst violation of a constraint; for an equality, the largest of all its entries.
+        """The cost of changing the worst violation of a constraint; of an equality, the largest of all its rows there.
 
         That is twice the total cost of a change by 1 unit, `1 / n' (S + Sbar)^-1 n` for the entry's slope n: the
         curvature of the total cost if the rest of the trajectory adapts.

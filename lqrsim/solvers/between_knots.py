@@ -2,7 +2,8 @@
 
 `Problem(accuracy=, between_knots=True)` is solved in rounds. Each looks at the last plan in continuous time, takes more
 Runge-Kutta steps in a period where these are not accurate enough, and adds rows within the periods in which an
-inequality is violated. If it is still violated between these, they spare that much. The next plan begins from the last.
+inequality is violated. Where it is still violated between these rows, they get a margin for that. The next plan begins
+from the last.
 
 The state within a period is the dynamics' from the state and the control of the period, so that a row there is one of
 both, as any other; its kernel is below.
@@ -47,10 +48,10 @@ MOST = 1024  # Runge-Kutta steps in a period, for exact motion and for plans
 ORDER = 4  # of Runge-Kutta steps: twice as many have a sixteenth of the error
 KNOWN = 1e-3  # share of an error to which it is to be known
 ROUNDS = 12  # plans after the first; most need two or three
-FAILED = 3  # failures after the first plan, one after the other or not, until the last of which it goes on
-SPARED = 1.2  # of what is violated between the times of a period, is spared at them: the next plan is another
-# Within a period, at equal distances, the last at its end: between them is a 64th of what is between knots.
-TIMES = 8
+MAX_FAILURES = 3  # failed plans after the first, in total, after each of which another is tried; the next is the last
+# Margin added at the times of a period, relative to the violation between them: the next plan is another.
+MARGIN_FACTOR = 1.2
+TIMES = 8  # rows in a period, at equal distances, the last at its end: a 64th of a violation between knots is left
 ROUNDING = 1e-9  # violation that is not mentioned
 
 
@@ -111,7 +112,8 @@ def _violations(problem: Problem, plan: Motion) -> tuple[list[Array], list[Array
     within = []
     for constraint, term in zip(problem.constraints, terms, strict=True):
         obstacles = constraint.kept_clear
-        # It is known at the knots only with obstacles that move, whatever its margins, or with the time.
+        # A constraint with moving obstacles, or one that changes with time otherwise than by knot, is known at the
+        # knots only, so it is not checked between them.
         moving = obstacles is not None and obstacles.world.moving
         moving = moving or (constraint.moving and not constraint.by_knot)
         within.append(not (term.equality or term.final_only or moving))
@@ -196,12 +198,12 @@ def solve_between_knots(
         begun = {} if problem.duration is None else {"begin": last}
         return solve(stated(last.trajectory.dt), replace(settings, start=last, starts=None), **begun)
 
-    solution, rounds, failed = solve(at_knots, settings), 0, 0
+    solution, rounds, failures = solve(at_knots, settings), 0, 0
     iterations, ended = solution.iterations, {}
-    while solution.success or (rounds and failed < FAILED and not stop.due):
+    while solution.success or (rounds and failures < MAX_FAILURES and not stop.due):
         if not solution.success:
-            failed += 1
-            if solution.violation <= tolerance and failed % 2:  # it is only not at its best
+            failures += 1
+            if solution.violation <= tolerance and failures % 2:  # it is only not at its best
                 solution = again(solution)
             else:  # another way than the last plan's
                 rows = [added.everywhere() for added in rows]
@@ -250,11 +252,11 @@ class WithinPeriods(Constraint):
 
     Attributes:
       acts: (K, rows) 1 for the periods in which a row acts, else 0.
-      spares: (rows,) by how much more than 0 the rows are to be there.
+      margins: (rows,) the least value of each row there.
     """
 
-    def __init__(self, constraint: Constraint, acts: Array, spares: Array) -> None:
-        self.constraint, self.acts, self.spares = constraint, acts, spares
+    def __init__(self, constraint: Constraint, acts: Array, margins: Array) -> None:
+        self.constraint, self.acts, self.margins = constraint, acts, margins
 
     def everywhere(self) -> Self:
         """With the rows that act in some period acting in all."""
@@ -263,32 +265,32 @@ class WithinPeriods(Constraint):
     def against(self, worst: Array, tolerance: float) -> Self:
         """With rows in the periods where violations (T, rows) are, and beside them, since a plan may turn up there.
 
-        Where such rows act already, they spare what is violated between them.
+        Where such rows act already, they get a margin for what is violated between them.
         """
         missed = worst > tolerance
         near = missed.copy()
         near[1:] |= missed[:-1]
         near[:-1] |= missed[1:]
         again = np.where(missed & (self.acts > 0), worst, 0.0).max(axis=0)
-        more = np.where(again > 0, SPARED * again, 0.0)
-        return type(self)(self.constraint, np.maximum(self.acts, near), np.maximum(self.spares, 0.5 * tolerance) + more)
+        margins = np.maximum(self.margins, 0.5 * tolerance) + MARGIN_FACTOR * again
+        return type(self)(self.constraint, np.maximum(self.acts, near), margins)
 
     @property
     def by_knot(self) -> bool:
         return True
 
     def _at_other_knots(self, select: Callable[[Array], Array]) -> Self:
-        return type(self)(self.constraint, select(self.acts), self.spares)
+        return type(self)(self.constraint, select(self.acts), self.margins)
 
     def with_added_state(self, dynamics: Dynamics) -> Self:
-        return type(self)(self.constraint.with_added_state(dynamics), self.acts, self.spares)
+        return type(self)(self.constraint.with_added_state(dynamics), self.acts, self.margins)
 
     def bind(self, dynamics: Dynamics) -> ConstraintTerm:
         return self._bind_at(dynamics, np.arange(len(self.acts) + 1.0), {})
 
     def _bind_at(self, dynamics: Dynamics, times: Array, goals: Mapping[int, float]) -> ConstraintTerm:
         term = self.constraint._bind_at(dynamics, times, goals)
-        numbers = [times[1] - times[0], *self.acts.shape, *dynamics.data, *self.spares, *self.acts.ravel()]
+        numbers = [times[1] - times[0], *self.acts.shape, *dynamics.data, *self.margins, *self.acts.ravel()]
         kernel = source_of(
             __name__, AT=len(term.functions) + len(term.data), PARAMETERS=len(dynamics.data), SHARED=term.shared,
             BOTH=int(self.constraint.by_knot and not term.uses_control),
@@ -305,8 +307,8 @@ class WithinPeriods(Constraint):
         )  # fmt: skip
 
 
-# The kernel of WithinPeriods. From AT on, `data` has the numbers below, the parameters of the dynamics, the spares, and
-# which rows act in each period. There is a row for each of the constraint's at the first time, and so on.
+# The kernel of WithinPeriods. From AT on, `data` has the numbers below, the parameters of the dynamics, the margins,
+# and which rows act in each period. There is a row for each of the constraint's at the first time, and so on.
 AT = 0
 # From there on: the length of a period, the number of periods, and of the constraint's rows.
 LENGTH, PERIODS, ROWS, OTHERS = 0, 1, 2, 3
@@ -316,7 +318,7 @@ BOTH = 0  # whether the constraint has other numbers at the end of the period
 
 
 def value(x, u, t, row, data):
-    """The constraint within the period, minus what is spared; infinite where it does not act."""
+    """The constraint within the period, minus its margin; infinite where it does not act."""
     rows = int(data[AT + ROWS])
     own = row % rows
     if not acting(t, own, data):

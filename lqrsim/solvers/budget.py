@@ -109,7 +109,7 @@ class Stop:
 
     @contextlib.contextmanager
     def heeding(self) -> Iterator[None]:
-        """A block that any exception ends, even Ctrl-C; the exception is raised again with the solution."""
+        """A block whose exception, even Ctrl-C, is kept; `deliver` raises it."""
         try:
             yield
         except BaseException as error:
@@ -197,7 +197,8 @@ class Budget:
     def joined_with_last(self, method: str) -> Iterator[None]:
         """Temporarily count a single further iteration, which only evaluates the plan, as part of the last iteration.
 
-        So is the last of several, if it is one more than are allowed. The callback is called at the end.
+        The last of several is joined only if it is one more than are allowed. The callback is called for several
+        iterations at the end, and not for a single one that is joined.
         """
         begin, callback, self._callback = len(self.log), self._callback, None
         try:
@@ -213,7 +214,7 @@ class Budget:
 
 
 class Laps:
-    """Records the iterations of a method that Python runs itself, with their seconds and improvements on a first cost.
+    """Records iterations of a method with their seconds and their improvements on the previous cost, at first `cost`.
 
     `ended` is the time of `time.perf_counter` at which the last of them ended.
     """
@@ -237,9 +238,9 @@ def in_slices(
 ) -> Iterator[tuple[Sequence[Any], bool]]:  # fmt: skip
     """Run compiled iterations from `first` on, as long as the log has room for their rows.
 
-    A slice is some of `attention` seconds: 0 for one iteration, as if plain Python functions are to be heard, infinity
-    for all. It is `run(begin, end)`, whose result, beginning with the number of iterations, is yielded, with whether it
-    is over: `watch` was true for one of its rows and the seconds of an iteration.
+    Each slice lasts about `attention` seconds; 0 means one iteration, as always with plain Python functions, infinity
+    all. After each slice the result of `run(begin, end)` is yielded, which begins with the number of iterations, and
+    whether `watch`, called with a row and the seconds of an iteration, was true for one of its rows.
     """
     last, over = len(log), False
     attention, size = (np.inf, last) if attention == np.inf else (0.0 if functions else attention, 1)

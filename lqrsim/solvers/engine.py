@@ -105,6 +105,7 @@ class RunResult:
     cost: float = np.inf  # of the plan, as in the log; infinite without a plan
     violation: float = np.inf
     gap: float = np.nan
+    origin: str = ""  # in words, the plan of another problem with which it began
     detail: str = ""
     values: dict[str, Any] = field(default_factory=dict)  # cost-to-go, cost-to-come and inverse policy, for `assemble`
     multipliers: tuple[Multipliers, ...] = ()

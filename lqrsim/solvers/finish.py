@@ -201,7 +201,7 @@ class InteriorRun:
         """The result from a plan that has not converged, or whose cost no longer changes."""
         # The rollout with gains about the plan, or without gains if this violates the constraints less.
         plan, gain = interior.plan, interior.gain
-        policies = [compiled.policy_about(*plan, gains) for gains in (gain.copy(), np.zeros_like(gain))]
+        policies = [compiled.policy_about(*plan, gains) for gains in (gain, np.zeros_like(gain))]
         candidates = (self.result(self._run.work.roll_out(policy, plan.states[0]), policy) for policy in policies)
         result = min(candidates, key=lambda result: (not np.isfinite(result.cost), result.violation, result.cost))
         if not interior.flat or result.violation > self._allowed:
@@ -530,9 +530,9 @@ class ConstrainedRun(InteriorRun):
                 return None
             plan = priced.plan
             self._remember(self.result(plan))
-            if priced.stationary:
+            if priced.violation_stationary:
                 return None
-            if priced.near or price == PRICES[-1]:
+            if priced.nearly_feasible or price == PRICES[-1]:
                 result = self.run_from(plan, STRONG)
             elif self._untried and self._initial.violation <= self._allowed:
                 result = self._from_start()

@@ -33,7 +33,7 @@ from lqrsim.solvers.settings import INSIDE
 
 MOST_KEPT, LARGEST_KEPT = 16, 8 * 1024 * 1024  # memories that are kept for later solves, and largest size in bytes
 # Iterations in which the cost has changed by less than rounding, relative to itself, so that no slope is left.
-RESTS, ROUNDING = 50, 1e-10
+ROUNDING_ITERATIONS, ROUNDING = 50, 1e-10
 NAME = "interior point"  # name of its iterations in the log
 STEPS = 12  # largest number of steps of an active set: a solve that needs more does not converge
 M = TypeVar("M")
@@ -142,8 +142,8 @@ class Stages:
         for row, (sign, i, side) in zip(np.flatnonzero(limit), self.limits, strict=True):
             self.about.rows.limits[row, [CONTROL, SIGN, SIDE]] = i, sign, side
 
-    def state(self, *, price: float | Array | None = None, margin: float | None = None) -> None:
-        """State prices of violations, in cost per unit, for all or each of the rows; or a margin. Limits have none."""
+    def set_prices_and_margins(self, *, price: float | Array | None = None, margin: float | None = None) -> None:
+        """Set prices of violations, in cost per unit, for all or each of the rows; or a margin. Limits have none."""
         limit = self.owners == -1
         if price is not None:
             self._prices[...] = np.where(limit, np.inf, price)
@@ -320,7 +320,7 @@ STRONG, MEDIUM, WEAK = Barrier(1.0, 0.06), Barrier(1.0, 0.02), Barrier(0.01, 0.0
 class InteriorResult:
     """Result of a run."""
 
-    plan: Motion  # feasible except for gaps
+    plan: Motion  # if `solved`, feasible except for gaps
     gain: Array  # (T, m, n) about it
     measures: Measures
     multipliers: tuple[Array, ...]  # of each constraint (T+1, rows)
@@ -366,7 +366,7 @@ class InteriorPoint:
         self._tolerances = np.nan, np.nan
         self._call(SCALE, 0)
         self._sizes = stages.sized(float(self._memory["typical"][0]))
-        stages.state(price=price(self._sizes) if callable(price) else price)
+        stages.set_prices_and_margins(price=price(self._sizes) if callable(price) else price)
         self._call(BEGIN, 0)
 
     def run(
@@ -393,7 +393,7 @@ class InteriorPoint:
             self._arrays = self._arrays._replace(filter=np.zeros((most, 2)))
             self._stages.interior = self._arrays, self._memory
         self._tolerances = float(tolerance), float(violation)
-        self._stages.state(margin=INSIDE * violation)
+        self._stages.set_prices_and_margins(margin=INSIDE * violation)
         clock = time.perf_counter()
         if near and self._call(POLISH, 1)[1] == CONVERGED:
             self._iterations = 1
@@ -410,13 +410,13 @@ class InteriorPoint:
                 break
         if outcome == RUNNING:
             self._call(CLOSE, self._iterations)
-        return self._result(bool(self._memory["solved"][0]) or self._rests())
+        return self._result(bool(self._memory["solved"][0]) or self._is_at_rounding())
 
-    def _rests(self) -> bool:
+    def _is_at_rounding(self) -> bool:
         """Whether only rounding of the slope is left, which unstable dynamics enlarge."""
-        tolerance, violation = self._tolerances
-        last, now = self._log[max(self._iterations - RESTS, 0) : self._iterations], Measures.of(self._memory)
-        if len(last) < RESTS or self._stages.about.learns or now.violation > violation:
+        (tolerance, violation), now = self._tolerances, Measures.of(self._memory)
+        last = self._log[max(self._iterations - ROUNDING_ITERATIONS, 0) : self._iterations]
+        if len(last) < ROUNDING_ITERATIONS or self._stages.about.learns or now.violation > violation:
             return False
         return np.ptp(last["cost"]) <= ROUNDING * abs(now.cost) and max(now.gap, now.complementarity) < tolerance
 
@@ -431,7 +431,7 @@ class InteriorPoint:
         for row, (sign, i, _) in zip(np.flatnonzero(stages.owners == -1), stages.limits, strict=True):
             pressing[:, i] -= sign * stages.force[:-1, row]
         return InteriorResult(
-            plan=deepcopy(self._arrays.now.plan), gain=stages.about.policy.gain,
+            plan=deepcopy(self._arrays.now.plan), gain=stages.about.policy.gain.copy(),
             measures=Measures.of(self._memory), multipliers=tuple(stages.by_constraint(stages.force)),
             pressing=pressing, solved=solved, flat=bool(self._memory["unchanged"][0] >= FLAT_BEFORE_END),
             sizes=self._sizes, scale=float(self._memory["scale"][0]),
@@ -439,11 +439,11 @@ class InteriorPoint:
 
 
 class Restored(NamedTuple):
-    """A trajectory, and two facts about it."""
+    """Result of a restoration."""
 
     plan: Motion
-    stationary: bool  # whether its violation is
-    near: bool  # whether it is nearly feasible
+    violation_stationary: bool
+    nearly_feasible: bool
 
 
 def restore(
@@ -502,7 +502,7 @@ class ActiveSet:
         self._arrays, self._memory = stages.active_set
         self.plan, self.held = self._arrays.plan, stages.held
         self.plan.states[...], self.plan.controls[...] = plan
-        stages.state(price=np.inf, margin=INSIDE * violation)
+        stages.set_prices_and_margins(price=np.inf, margin=INSIDE * violation)
         stages.force[...] = stages.of_constraints(multipliers)
         clock = time.perf_counter()
         self._call(active_set.BEGIN)

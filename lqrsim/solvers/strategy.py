@@ -58,10 +58,10 @@ CALLERS_START = "the given start"  # name of the start that the caller gives
 
 LEFT = 1e-3  # slope of the final cost, relative to the slope at the end of a given plan, that has died away
 # Part of the cost that a change of a state by its size would save, from which on its goal counts as missed.
-MOST_OF = 0.1
+MISSED_SHARE = 0.1
 NEARER = 0.3  # part of the way to its goal that a body must be taken
 LEAST_WAY = 0.1  # least way of a joint, relative to the longest, by which its weight along an approach is scaled
-NONE = 1e-9  # change of a state, relative to its size, that counts as none
+NO_CHANGE = 1e-9  # change of a state, relative to its size, that counts as none
 
 R = TypeVar("R")
 Finish = Callable[[SolveRun, Known], R]
@@ -115,10 +115,10 @@ class Runs:
         self.offer(run, self.result_of(run, how))
 
     def offer(self, run: SolveRun, result: RunResult, *, better: bool | None = None) -> None:
-        """Record a result; it becomes the best if `better` says so, by default if its rank does."""
-        self.finished.insert(0 if better else len(self.finished), (run, result))
+        """Record a result; it becomes the best if `better` says so, by default if its rank is before all others."""
         if better is None:
-            self.finished.sort(key=lambda pair: pair[1].rank)  # a stable sort: of equal ranks, the first result
+            better = all(result.rank < other.rank for _, other in self.finished)
+        self.finished.insert(0 if better else len(self.finished), (run, result))
 
     def cheaper_elsewhere(self, less: float) -> int | None:
         """Number of the cheapest plan that keeps the constraints, if it costs less than the best by this share."""
@@ -435,7 +435,7 @@ class Search:
         return False
 
     def keep_given(self, given: RunResult) -> None:
-        """If the best plan is worse than the caller's, or has left what that moved, descend from the caller's plan."""
+        """If the best plan is worse than the caller's, or leaves alone states that this moved, descend from that."""
         run, best = self.runs.finished[0]
         still = _differ(best, given, self._approaches.unmoved())
         worsened = still or best.is_worse(given, run.work) or _goal_left(self._problem, best, given)
@@ -532,7 +532,8 @@ class Search:
 
         Far means farther than the robot's radius, or, without a position, than the tolerance of a goal. Through means
         deeper than half the radius, or half the radius of the largest collision sphere. Without an ObstacleCost, a plan
-        is unacceptable if it violates the constraints, or does nothing.
+        is unacceptable if it violates the constraints, or does nothing. With one, a plan that has not converged is
+        unacceptable exactly if iterations are left.
         """
         problem, space, (run, best) = self._problem, self._problem.dynamics.state_coordinates, self.runs.finished[0]
         if not self._guided or problem.goal is None:
@@ -639,7 +640,7 @@ class Approaches:
         sizes = np.where(sizes > 0, sizes, 1.0)
         with self._stop.not_counting():  # compiling
             slope = _final_cost(problem, end)[1]
-        missed = np.abs(slope) * sizes > MOST_OF * abs(best.cost)
+        missed = np.abs(slope) * sizes > MISSED_SHARE * abs(best.cost)
         for i, number in goals_of(problem.constraints, problem.dynamics).items():
             missed[i] |= abs(end[i] - number) > self._runs.method.violation
         space, places = problem.control_coordinates, np.flatnonzero(missed)
@@ -651,7 +652,7 @@ class Approaches:
                 break
             with np.errstate(all="ignore"):
                 a, b, _ = problem.dynamics.linearize(state, control, problem.dt)
-            still = (np.abs(pull @ b) * span).sum(axis=1) <= NONE * sizes[places]
+            still = (np.abs(pull @ b) * span).sum(axis=1) <= NO_CHANGE * sizes[places]
             places, pull = places[still], (pull @ a)[still]
         return self._unmoved.setdefault(best, places.tolist())
 
@@ -670,7 +671,7 @@ class Approaches:
         gain = np.zeros((problem.steps, len(problem.nominal_control), len(states[0])))
         sways = (sinusoidal_controls(problem, cycles) for cycles in SWAYS[:2])
         others = (compiled.rollout(problem, gain, controls, states[0].copy()).states for controls in sways)
-        otherwise = bool(bodies) or any((np.abs(other - states)[:, places] > NONE).any() for other in others)
+        otherwise = bool(bodies) or any((np.abs(other - states)[:, places] > NO_CHANGE).any() for other in others)
         status = Status.STALLED if result.success and otherwise else result.status
         names = ", ".join(named)
         remedy = f"leave {names} out of the goal, which no control that was tried changes"
@@ -684,7 +685,7 @@ class Approaches:
         return replace(result, status=status, detail=joined(*parts), remedy=remedy)
 
     def _in_words(self, result: RunResult, *, untouched: bool) -> str:
-        """In words, what came of motions that were to bring states nearer to their goal that a plan does not change."""
+        """A text on the motions that were tried to change the states that no control changes along a plan."""
         if self._cheapest is not None:
             name, cost = self._cheapest
             return f"{name} brings it nearer to its goal, at a cost of {cost:.3g} instead of {result.cost:.3g}"
@@ -799,8 +800,7 @@ class Softening:
         run = self._runs.add(guess_from(plans[origin], "a plan for softer contacts"))
         ended = self._runs.result_of(run, refine, most=most)
         stages = ", ".join([*before, *(name for name, _ in soft)])
-        detail = joined(f"begun with contacts of softness {stages}{origin}", ended.detail)
-        ended = replace(ended, detail=detail)
+        ended = replace(ended, origin=f"begun with contacts of softness {stages}{origin}")
         self._runs.offer(run, ended, better=self._is_better(ended))
         return ended
 
@@ -824,8 +824,7 @@ class Softening:
         if result is None:
             return False
         self._runs.named.append(("the best plan, within its contact modes", run))
-        detail = joined(plan.detail.partition("; ")[0], result.detail)
-        self._runs.offer(run, replace(result, detail=detail), better=result.rank <= self._runs.best.rank)
+        self._runs.offer(run, replace(result, origin=plan.origin), better=result.rank <= self._runs.best.rank)
         return True
 
     @property
@@ -882,7 +881,7 @@ def guess_from(result: RunResult, summary: str) -> InitialGuess:
 
 def _differ(plan: RunResult | Motion, other: RunResult | Motion, places: list[int]) -> bool:
     """Whether two plans end with different values of these states."""
-    return bool((np.abs(plan.states[-1] - other.states[-1])[places] > NONE).any())
+    return bool((np.abs(plan.states[-1] - other.states[-1])[places] > NO_CHANGE).any())
 
 
 def _goal_left(problem: Problem, result: RunResult, baseline: RunResult) -> bool:
@@ -910,9 +909,10 @@ def _missing(problem: Problem, state: Array, places: list[int]) -> Array:
 
 
 def _approaches(problem: Problem, result: RunResult, places: list[int]) -> Iterator[tuple[str, Problem]]:
-    """Problems in which the robot passes through a body that nothing touches, and is drawn along motions that take the
-    body to its goal, in words. Their solutions are starts in which the robot touches the body, whose own goals are left
-    out of the constraints, as it does not move there.
+    """Motions that take a body that nothing touches to its goal, in words, and problems that draw the robot along them.
+
+    There the robot passes through the body, which does not move: its goals are left out of the constraints. The
+    solutions are starts in which the robot touches the body.
     """
     constraints = [part for part in problem.constraints if not part.final_states(problem.dynamics)]
     shortfall = _missing(problem, result.states[-1], places)
