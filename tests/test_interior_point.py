@@ -640,7 +640,7 @@ def test_from_a_start_thrown_far_off_the_merit_falls(far: float) -> None:
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=examples(10))
 def test_a_result_stays_as_it_is_when_another_run_uses_its_memory(seed: int) -> None:
-    rng, stages = np.random.default_rng(seed), Stages(problem())
+    rng, stages = np.random.default_rng(seed), Stages(problem(limit=1.0))
     plans = [Motion(rng.normal(size=(16, 2)), rng.normal(size=(15, 1))) for _ in range(2)]
     first = InteriorPoint(stages, plans[0]).run(tolerance=1e-8, violation=1e-6, most=20)
     before = deepcopy(first)
