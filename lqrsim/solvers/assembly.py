@@ -64,7 +64,7 @@ def assemble(
     said = result.origin, result.detail, usable, *doubts, unstable, _sites(problem, states)
     nominal = states.copy()  # a user may write to the states of the plan, as to convert angles for a plot
     later = {
-        "inverse_policy": lambda: affine(*inverse_policy, nominal[1:]) if inverse_policy is not None else None,
+        "inverse_policy": lambda: None if inverse_policy is None else affine(*inverse_policy, nominal=nominal[1:]),
         "clearance": lambda: clearance_of(problem, nominal),
         "problem_digest": lambda: problem.digest,
         "problem_parts": lambda: parts_of(problem),

@@ -2,8 +2,7 @@
 
 `Problem(accuracy=, between_knots=True)` is solved in rounds. Each looks at the last plan in continuous time, takes more
 Runge-Kutta steps in a period where these are not accurate enough, and adds rows within the periods in which an
-inequality is violated. Where it is still violated between these rows, they get a margin for that. The next plan begins
-from the last.
+inequality is violated. Where it is still violated between these, they get a margin. The next plan begins from the last.
 
 The state within a period is the dynamics' from the state and the control of the period, so that a row there is one of
 both, as any other; its kernel is below.
@@ -49,8 +48,7 @@ ORDER = 4  # of Runge-Kutta steps: twice as many have a sixteenth of the error
 KNOWN = 1e-3  # share of an error to which it is to be known
 ROUNDS = 12  # plans after the first; most need two or three
 MAX_FAILURES = 3  # failed plans after the first, in total, after each of which another is tried; the next is the last
-# Margin added at the times of a period, relative to the violation between them: the next plan is another.
-MARGIN_FACTOR = 1.2
+MARGIN_FACTOR = 1.2  # margin added at the times of a period, relative to the violation between them
 TIMES = 8  # rows in a period, at equal distances, the last at its end: a 64th of a violation between knots is left
 ROUNDING = 1e-9  # violation that is not mentioned
 

@@ -197,8 +197,7 @@ class Budget:
     def joined_with_last(self, method: str) -> Iterator[None]:
         """Temporarily count a single further iteration, which only evaluates the plan, as part of the last iteration.
 
-        The last of several is joined only if it is one more than are allowed. The callback is called for several
-        iterations at the end, and not for a single one that is joined.
+        The last of several is joined only if it is one more than are allowed. The callback hears of several at the end.
         """
         begin, callback, self._callback = len(self.log), self._callback, None
         try:

@@ -435,7 +435,7 @@ class Search:
         return False
 
     def keep_given(self, given: RunResult) -> None:
-        """If the best plan is worse than the caller's, or leaves alone states that this moved, descend from that."""
+        """Descend from the caller's plan if the best is worse, or no longer moves states that the caller's moved."""
         run, best = self.runs.finished[0]
         still = _differ(best, given, self._approaches.unmoved())
         worsened = still or best.is_worse(given, run.work) or _goal_left(self._problem, best, given)
