@@ -43,7 +43,7 @@ from lqrsim.solvers.budget import Stop
 from lqrsim.solvers.settings import MISSED, SmootherSettings
 
 GRID = 16  # parts of a period at whose ends inequalities are evaluated; a parabola leads to the worst time between
-MOST = 1024  # Runge-Kutta steps in a period, for exact motion and for plans
+MOST = 1024  # largest number of Runge-Kutta steps in a period, for exact motion and for plans
 ORDER = 4  # of Runge-Kutta steps: twice as many have a sixteenth of the error
 KNOWN = 1e-3  # share of an error to which it is to be known
 ROUNDS = 12  # plans after the first; most need two or three

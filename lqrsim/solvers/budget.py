@@ -156,7 +156,7 @@ class Budget:
         self._call((iteration,))
 
     def report(self) -> None:
-        """From now on call the callback, and at once with the iterations so far, for this run is run to its end."""
+        """Call the callback with the iterations so far, and from now on with each: this run goes on to its end."""
         self._callback = self.stop.callback
         self._call(self.log[self._reported :])
 
@@ -171,7 +171,7 @@ class Budget:
 
     @contextlib.contextmanager
     def limited(self, most: int | None) -> Iterator[None]:
-        """Temporarily allow at most this number of further iterations, or as many as before."""
+        """Temporarily allow at most this number of further iterations; None for as many as before."""
         before, self._most = self._most, self._most if most is None else min(self._most, len(self.log) + most)
         try:
             yield
@@ -260,7 +260,7 @@ def in_slices(
 class _Watch:
     """The thread that reports progress, one for all activities of the process, for starting one takes long.
 
-    It looks at them at most every `SILENT` seconds, and ends when there was none for as long.
+    It looks at them at least every `SILENT` seconds, and ends when there was none for as long.
     """
 
     def __init__(self) -> None:
