@@ -142,7 +142,6 @@ def outdated(extra: str = "") -> str:
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """The numbers with which a version begins."""
     leading = re.match(r"\d+(\.\d+)*", version)
     return tuple(int(part) for part in leading[0].split(".")) if leading else ()
 

@@ -1088,7 +1088,6 @@ def _is_struct(kind: Type) -> TypeGuard[Pointer]:
 
 
 def _is_address(value: Value) -> bool:
-    """Whether a value is the address of a record."""
     return isinstance(value.type, Group) and bool(value.name)
 
 

@@ -391,10 +391,6 @@ class CollisionGeoms:
         model = self.scene.model
         return float(model.geom_rbound[solid_geoms(model)].max(initial=0.0))
 
-    def of_scene(self, scene: Scene) -> bool:
-        """Whether these geoms belong to that scene, with its obstacles."""
-        return scene is self.scene or (scene.xml == self.scene.xml and scene.geoms == self.scene.geoms)
-
     def in_world(self, dynamics: Dynamics, world: World) -> "GeomsInWorld":
         """The geoms among obstacles, which must be in the robot's MJCF; the dynamics are the robot's."""
         if not isinstance(dynamics.calling, MjcfDynamics):

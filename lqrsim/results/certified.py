@@ -83,10 +83,6 @@ class Funnel:
         ):
             if wrong.any():
                 raise InputError(f"Funnel: {name}: got {excerpt(getattr(self, name))}, want {want}")
-        self._check_certified()
-
-    def _check_certified(self) -> None:
-        """Raises InputError if the fresh trials do not certify their level."""
         doubt = (1 - self.confidence) / len(self.knots)  # Bonferroni: at one knot, for all to hold at once
         for trials, successes in zip(self.trials.tolist(), self.successes.tolist(), strict=True):
             if trials and _chance_of_so_few(trials - successes, trials, self.rate) > doubt * (1 + 1e-6):

@@ -169,11 +169,6 @@ class Records:
         """The times of knots (K,) in s; infinite beyond the last one."""
         return np.where(knots <= self.plan.steps, self.plan.dt * knots, np.inf)
 
-    def turn_to_plan(self, space: Coordinates) -> None:
-        """Replace the angles of all states by their representatives nearest the plan."""
-        for array in (self.states, self.measured):
-            turn_to_nearest(space, array.transpose(1, 0, 2), self.plan.states)
-
     def finish(self, parts: int, *, all_frames: bool) -> Array:
         """Set the records after the end of a trial to NaN, and return the frames (K, F, nq), NaN as well.
 
@@ -596,7 +591,8 @@ class ClosedLoop:
     def rollout(self, *, undisturbed: bool = False) -> Rollout:
         """A Rollout of all records; if asked for, with the states of an undisturbed run."""
         records, collisions = self.records, self.collisions
-        records.turn_to_plan(self.state_coordinates)
+        for array in (records.states, records.measured):
+            turn_to_nearest(self.state_coordinates, array.transpose(1, 0, 2), records.plan.states)
         alone = self.run_undisturbed() if undisturbed else None
         plant, plan, parts = self.plant, self.trajectory, self.physics.drawn_parts
         goal, radius = self.remaining_plan.goal, self._radius

@@ -86,7 +86,8 @@ class Plant(OneVersion):
         self._step: float | None = None  # s, in place of the timestep of the MJCF
         # The last undisturbed run of a plan's own policy: hash of the policy, the plan's states, and the run's.
         self.ran: tuple[str, bytes, Array | None] | None = None
-        if robot.geoms is not None and not robot.geoms.of_scene(scene):
+        planned = scene if robot.geoms is None else robot.geoms.scene
+        if planned is not scene and (planned.xml, planned.geoms) != (scene.xml, scene.geoms):
             raise InputError(f"scene {scene.name}: got a scene other than the robot's own, want robot.scene")
         self.shape = shape_in(robot.dynamics, scene.world, **robot.shape)
         in_space = self.shape.centers is not None and not self.shape.in_plane

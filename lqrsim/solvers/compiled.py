@@ -123,7 +123,6 @@ def _term_functions(terms: tuple[tuple[Source, tuple[int, ...] | None], ...], si
 
 @functools.lru_cache(maxsize=1024)
 def _constraint_functions(constraints: tuple[tuple[Source, int, bool, bool], ...], sizes: _Sizes) -> Array:
-    """`Constraints.functions`."""
     rows = []
     for code, shared, equality, uses_control in constraints:
         pairs = {"constraint_value": (code, "value"), "constraint_slope": (code, "slope")}

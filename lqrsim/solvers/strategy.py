@@ -167,7 +167,9 @@ class Search:
                     self.try_other_starts()
                     if trees and self.may_go_on and self.is_barred:
                         self.grow_trees()
-                    self.try_detours()
+                    for name, trajectory in self._detours().items():
+                        if not self._stop.due:
+                            self.runs.try_from(name, trajectory)
                     self.leave_saddles()  # while the best plan is one
             if not answered:
                 self.try_other_dynamics(given)
@@ -247,7 +249,8 @@ class Search:
         too_high = any(run.ending.outcome == declarations.RISK_TOO_HIGH for _, run in self.runs.named)
         if self._problem.risk > 0 and too_high and self.may_go_on:
             self.retry_without_risk()
-        if self._default and self.may_go_on and (self._approaches.left_alone or not self.runs.best.success):
+        left_alone = self._approaches.best_nearer is not None and not self._approaches.comes_nearer(self.runs.best)
+        if self._default and self.may_go_on and (left_alone or not self.runs.best.success):
             self._softening.soften()
         if given is not None:
             self.keep_given(given)
@@ -378,11 +381,6 @@ class Search:
         # Even a plan that has not converged is better than doing nothing.
         self.runs.offer(chosen, result, better=result.violation <= best.violation and result.cost < best.cost)
         self.tried = not self._stop.due
-
-    def try_detours(self) -> None:
-        for name, trajectory in self._detours().items():
-            if not self._stop.due:
-                self.runs.try_from(name, trajectory)
 
     def _detours(self) -> dict[str, Trajectory]:
         """New paths on other sides of constraints that the best plan touches, by name, unless a cost chose its side."""
@@ -622,11 +620,6 @@ class Approaches:
         first, places = self.still
         now, before = (_missing(self._problem, motion.states[-1], places) for motion in (plan, first))
         return bool(np.linalg.norm(now) < (1 - NEARER) * np.linalg.norm(before))
-
-    @property
-    def left_alone(self) -> bool:
-        """Whether another plan brings them nearer, and the best leaves them alone."""
-        return self.best_nearer is not None and not self.comes_nearer(self._runs.best)
 
     def unmoved(self) -> list[int]:
         """The states that miss their goal and that no control changes along the best plan."""

@@ -422,7 +422,10 @@ def plot_run(
             for run, color in zip(rollouts.values(), RUNS, strict=False)
             if run.collision_chance is not None and run.collision_chance.any()
         ]
-        across, strips = _strips(len(first.control_coordinates), style)
+        count = len(first.control_coordinates)
+        wide = count > STRIPS
+        rows = -(-count // int(LAYOUTS[style].width / NARROW)) if wide else count
+        across, strips = -(-count // rows), _strip_panel(rows, style, wide=wide)
         curves = [Panel(CURVE)] * (1 + bool(chances))
         of_time = [*curves, Panel(CURVE), strips] if strips.wide else [*curves, strips, Panel(CURVE)]
         parts = arrange(figure, [*views.panels(style), *of_time], style)
@@ -437,13 +440,6 @@ def plot_run(
         _convergence(figure.add_subplot(costs), solution)
         legend_below(figure, _entries(drawn[0]) | controls)
     return Path(path)
-
-
-def _strips(count: int, style: Style) -> tuple[int, Panel]:
-    """In how many columns so many strips are drawn, and their panel."""
-    wide = count > STRIPS
-    rows = -(-count // int(LAYOUTS[style].width / NARROW)) if wide else count
-    return -(-count // rows), _strip_panel(rows, style, wide=wide)
 
 
 def _strip_panel(rows: int, style: Style, *, wide: bool = False) -> Panel:
