@@ -91,7 +91,7 @@ from lqrsim.scenes.scene import scene_from_xml
 from lqrsim.solvers import compiled
 from lqrsim.solvers.between_knots import WithinPeriods
 from lqrsim.solvers.budget import Budget
-from lqrsim.solvers.engine import SolveRun, no_value
+from lqrsim.solvers.engine import LoopCall, SolveRun, no_value
 from lqrsim.solvers.settings import SmootherSettings, resolve
 from lqrsim.solvers.stages import InteriorPoint, Measures, Stages
 
@@ -423,8 +423,7 @@ def smoothed(one: ls.Problem, form: str = "dual", start: Any = None, task: str =
         replay(source, sizes, "smoother", *with_rows(arguments), but=but)
     found = run.result(replace(run.ending, outcome=declarations.MAX_ITERATIONS))
     for check in (declarations.CERTIFY, declarations.EVALUATE) if task else ():
-        arguments = run._check_arguments(check, found, work.arrays.to_go, np.zeros(1, CERTIFICATE))
-        replay(source, sizes, "smoother", *with_rows(arguments))
+        replay(source, sizes, "smoother", *of_check(run, check, found, work.arrays.to_go))
 
 
 class TestSolvers:
@@ -492,9 +491,7 @@ class TestSolvers:
         one = Begun(problem(initial=ls.FixedState([0.0, 0.0, 0.3]), steps=5), start=[0.2, 0.2])
         assert one.ilqr(0, 3)[0] == 3
         found = one.run.result(one.run.ending)
-        to_go, out = one.work.arrays.to_go, np.zeros(1, CERTIFICATE)
-        arguments = one.run._check_arguments(declarations.CERTIFY, found, to_go, out)
-        replay(one.source, one.sizes, "ilqr", *with_rows(arguments))
+        replay(one.source, one.sizes, "ilqr", *of_check(one.run, declarations.CERTIFY, found, one.work.arrays.to_go))
 
     def test_what_is_done_after_failures(self) -> None:
         for second_order, reach, weight in ((0.5, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.25, 0.0), (0.0, 0.0, 1e-4)):
@@ -571,6 +568,15 @@ def steps_of(run: SolveRun, how: Descent, first: int, last: int, log: Structured
     return run._plan_arguments(declarations.DESCEND, how, tolerance, 0.0, first, last, log)
 
 
+def of_check(run: SolveRun, task: int, result: Any, to_go: Any) -> Any:
+    """Arguments with which the run checks this result."""
+    calls: list[tuple[Any, ...]] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "_loop", lambda *arguments: calls.append(arguments))
+        run.check(task, result, to_go, np.zeros(1, CERTIFICATE))
+    return with_rows(LoopCall(*calls[0]))
+
+
 def descended(
     one: ls.Problem, form: str = "dual", count: int = 3, tolerance: float = 1e-12, factor: float = 1.0, **memory: float
 ) -> int:
@@ -597,8 +603,7 @@ def descended(
             _, outcome, _, _ = replay(source, sizes, "smoother", *with_rows(arguments), but=but)
     if not sizes["NOISY"]:
         found = run.result(run.ending)
-        arguments = run._check_arguments(declarations.CURVE, found, work.arrays.to_go, np.zeros(1, CERTIFICATE))
-        replay(source, sizes, "smoother", *with_rows(arguments))
+        replay(source, sizes, "smoother", *of_check(run, declarations.CURVE, found, work.arrays.to_go))
     return outcome
 
 
@@ -791,12 +796,11 @@ class TestRareEnds:
         run = SolveRun(one, settings_of(), resolve(None, one), np.zeros(3), Budget(10))
         run.roll_out()
         found = run.result(replace(run.ending, outcome=declarations.MAX_ITERATIONS))
-        out = np.zeros(1, CERTIFICATE)
-        arguments = run._check_arguments(declarations.EVALUATE, found, no_value(found.states), out)
+        arguments = of_check(run, declarations.EVALUATE, found, no_value(found.states))
         found.plan.states[knot, state] = np.nan
-        replay(source_of(iterations), sizes_of(one), "smoother", *with_rows(arguments))
-        assert np.isnan(out[0]["dynamics_residual"])
-        assert np.isnan(out[0]["policy_residual"])
+        replay(source_of(iterations), sizes_of(one), "smoother", *arguments)
+        assert np.isnan(arguments.arrays.certificate[0]["dynamics_residual"])
+        assert np.isnan(arguments.arrays.certificate[0]["policy_residual"])
 
     def test_steps_of_linear_quadratic_problems_that_fail(self) -> None:
         """Backward, forward, and of their sum; what is returned tells which."""

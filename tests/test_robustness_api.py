@@ -61,8 +61,10 @@ def caller(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     level = logger.level
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("subjects"))
-        made = api.Caller(Path.cwd(), seed=1)
-        logger.setLevel(level)
+        try:
+            made = api.Caller(Path.cwd(), seed=1)
+        finally:
+            logger.setLevel(level)
         yield made
 
 

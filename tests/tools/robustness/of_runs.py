@@ -210,12 +210,12 @@ def campaigns(place: Place) -> dict[str, tuple[Any, ...]]:
             "progress": print_nothing,
         }, 0.1),
         "Results": ({"folder": place.folder / "campaign", "scenario": reference},),
+        "Results.goal_radius": ({"self": results, "policy": cell.policy},),
         "replay": ({"results": results, "cell": cell, "trial": 0, "frames": False, "contacts": True},),
         **{
             f"Results.{name}": ({"self": results, "cell": cell, **more},)
             for name, more in {
-                "outcomes": {"partial": True}, "tally": {"partial": True}, "reasons": {}, "shards": {}, "number": {},
-                "tables": {"partial": True},
+                "outcomes": {"partial": True}, "reasons": {}, "shards": {}, "number": {},
             }.items()
         },
         "compare": ({"first": results, "second": results, "policies": ("open_loop", "open_loop")},),
