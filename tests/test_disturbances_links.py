@@ -1,5 +1,6 @@
 """Measurements and commands that are late, lost or off, and actuators that are slow, weak or lost."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -238,18 +239,23 @@ def test_a_controller_that_sees_losses_is_told_which_measurements_got_lost(cage,
     drawn = MeasurementDropouts(loss).draw(steps + 1, [make(trial, place) for trial in range(trials)])
     lost = drawn[:, np.maximum(np.arange(steps) - behind, 0)]
     shown = {True: [], False: []}
-    for sees, seen in shown.items():
 
-        def hovering(state, t, seen=seen):
-            seen.append(state)
+    @dataclass(frozen=True)
+    class Hovering:
+        sees_losses: bool
+
+        def __call__(self, state, t):
+            shown[self.sees_losses].append(state)
             return plan.trajectory.controls[0]
 
-        hovering.sees_losses = sees
-        rollout = simulate(cage, plan, controller=hovering, disturbances=links, trials=trials, seed=seed)
-        assert np.isfinite(rollout.measured).all()
+    measured = [
+        simulate(cage, plan, controller=Hovering(sees), disturbances=links, trials=trials, seed=seed).measured
+        for sees in shown
+    ]
+    assert np.isfinite(measured).all()
     told, held = (np.reshape(seen, (steps, trials, 12)).swapaxes(0, 1) for seen in shown.values())
     np.testing.assert_array_equal(np.isnan(told), np.repeat(lost[:, :, None], 12, axis=2))
     for k in range(trials):
         expected = received(lost[k], plan.trajectory.states[0], told[k])
         np.testing.assert_array_equal(held[k], expected)
-    np.testing.assert_array_equal(held, rollout.measured[:, :-1])
+    np.testing.assert_array_equal(held, measured[-1][:, :-1])
